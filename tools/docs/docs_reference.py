@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import ast
 import inspect
+import itertools
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -102,22 +103,24 @@ def _kind_of_file(heading: str, schema: Mapping[str, Any], written: dict[str, st
     written[schema["title"]] = f"[{heading.lower()}](#{_slug(heading)})"
     for key, value in schema["properties"].items():
         inner, many = _inner(schema, value)
-        default = _default(key, value, schema.get("required", ()))
-        if inner is None or inner["title"] in written:
-            meaning = _meaning(value) if inner is None else _section(inner, many, value, written)
-            rows.append((f"`{key}`", default, meaning))
+        default, shown = _default(key, value, schema.get("required", ())), f"{key}{many}"
+        own, *held = _row(schema, key, value, "", default, written)
+        if len(held) < ENOUGH_FOR_A_TABLE:
+            rows += [own, *held]
             continue
-        shown = f"{key}{many}"
-        written[inner["title"]] = f"[`{shown}`](#{_slug(shown)})"
-        text = _one_line(value.get("description") or inner.get("description", ""))
+        text = _one_line(value.get("description") or (inner or {}).get("description", ""))
         below += [f"### `{shown}`", DEFAULTS.get(default, "None by default. ") + text, ""]
-        below += _table("key | default | meaning", _keys(schema, inner, shown, written))
+        below += _table("key | default | meaning", _together(held))
     text = _one_line(schema.get("description", ""))
-    return [f"## {heading}", text, "", *_table("key | default | meaning", rows), *below]
+    return [f"## {heading}", text, "", *_table("key | default | meaning", _together(rows)), *below]
 
 
 DEFAULTS = {"required": "Required. ", "its own": ""}
 KINDS = {"": "section", "[]": "list of sections", ".KEY": "section for each key"}
+
+
+ENOUGH_FOR_A_TABLE = 6
+"""Keys of a section; one with fewer stands in the table of its file."""
 
 
 def _keys(
@@ -125,16 +128,33 @@ def _keys(
 ) -> Iterator[tuple[str, str, str]]:
     """The keys of the section at a path, those of a section in it right below that one's own row."""
     for key, value in schema["properties"].items():
-        inner, many = _inner(root, value)
-        default, here = _default(key, value, schema.get("required", ())), f"{path}.{key}"
-        if inner is None:
-            yield f"`{here}`", default, _meaning(value)
-        elif inner["title"] in written:
-            yield f"`{here}`", default, _section(inner, many, value, written)
+        yield from _row(root, key, value, f"{path}.", _default(key, value, schema.get("required", ())), written)
+
+
+def _row(
+    root: Mapping[str, Any], key: str, value: Mapping[str, Any], path: str, default: str, written: dict[str, str]
+) -> Iterator[tuple[str, str, str]]:
+    """Of one key, and of those that it holds unless they were written before."""
+    inner, many = _inner(root, value)
+    here = f"{path}{key}"
+    if inner is None:
+        yield f"`{here}`", default, _meaning(value)
+    elif inner["title"] in written:
+        yield f"`{here}`", default, _section(inner, many, value, written)
+    else:
+        yield f"{_anchor(here + many)}`{here}`", default, _section(inner, many, value, written)
+        written[inner["title"]] = f"[`{here}{many}`](#{_slug(here + many)})"
+        yield from _keys(root, inner, here + many, written)
+
+
+def _together(rows: Iterable[tuple[str, str, str]]) -> Iterator[tuple[str, str, str]]:
+    """Neighbouring keys with one default and one type, where there is nothing else to say of them, in one row."""
+    for (default, kind), keys in itertools.groupby(rows, lambda row: row[1:]):
+        names = [name for name, _, _ in keys]
+        if "." in kind:
+            yield from ((name, default, kind) for name in names)
         else:
-            yield f"{_anchor(here + many)}`{here}`", default, _section(inner, many, value, written)
-            written[inner["title"]] = f"[`{here}{many}`](#{_slug(here + many)})"
-            yield from _keys(root, inner, here + many, written)
+            yield ", ".join(names), default, kind
 
 
 def _section(inner: Mapping[str, Any], many: str, value: Mapping[str, Any], written: Mapping[str, str]) -> str:
@@ -206,7 +226,8 @@ def commands_page() -> str:
     (groups,) = (action for action in _parser()._actions if isinstance(action, argparse._SubParsersAction))
     return _page(
         "Command-line reference",
-        "Every command prints this with `--help`. `--json` prints for programs what is otherwise printed for people.",
+        "Every command prints this with `--help`, and more examples and costs. `--json` prints for programs what is",
+        "otherwise printed for people.",
         "No command overwrites a file or an earlier flight, unless `--force` is given.",
         "",
         *_table("exit code | meaning", (map(str.strip, line.split(maxsplit=1)) for line in codes)),
@@ -216,6 +237,8 @@ def commands_page() -> str:
 
 SAID_ABOVE = re.compile("print (JSON|the [a-z]+ as JSON|what was flown as JSON)|overwrite .*")
 """Help of options that the page explains once."""
+EXAMPLES = 2
+"""Of each command."""
 
 
 def _leaves(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
@@ -238,9 +261,10 @@ def _group(group: argparse.ArgumentParser) -> list[str]:
         for action in filter(lambda action: not SAID_ABOVE.fullmatch(action.help or ""), _shown(command)):
             takers.setdefault((_named(action), _help(command, action)), []).append(f"`{name}`")
         shown, _, note = (command.epilog or "").partition("\n\n")
-        examples += [line.strip() for line in shown.splitlines()[1:]]
-        fence = ["```"] if "\n  " in note else []
-        notes += [*fence, *note.splitlines(), *fence, ""] if note else []
+        new = [line.strip() for line in shown.splitlines()[1:] if line.strip() not in examples]
+        examples += new[:EXAMPLES]
+        if note and "\n  " not in note:
+            notes += [*note.splitlines(), ""]
     usage = [f"`{_usage(command)}`: {command.description}" for command in commands.values()]
     if len(commands) == 1:
         options = _table("option | meaning", takers)
@@ -253,7 +277,7 @@ def _group(group: argparse.ArgumentParser) -> list[str]:
                 for (option, text), of in takers.items()
             ),
         )
-    return [f"## {group.prog}", *usage, "", *options, "```sh", *dict.fromkeys(examples), "```", "", *notes]
+    return [f"## {group.prog}", *usage, "", *options, "```sh", *examples, "```", "", *notes]
 
 
 def _shown(parser: argparse.ArgumentParser) -> list[argparse.Action]:
@@ -311,10 +335,12 @@ def messages_page() -> str:
     for node in ast.parse(inspect.getsource(topics)).body:
         if isinstance(node, ast.ClassDef) and any(isinstance(b, ast.Name) and b.id == "TypedDict" for b in node.bases):
             fields.append((f"{_anchor(node.name)}**{node.name}**", "", _one_line(ast.get_docstring(node) or "")))
+            first = len(fields)
             for name, kind, text in _fields(node):
                 type_ = f"`{kind.replace(' | None', ' or null')}`"
-                if not text and fields[-1][1:] == (type_, ""):
-                    fields[-1] = (f"{fields[-1][0]}, `{name}`", type_, "")
+                alike = [i for i in range(first, len(fields)) if not text and fields[i][1:] == (type_, "")]
+                if alike:
+                    fields[alike[0]] = (f"{fields[alike[0]][0]}, `{name}`", type_, "")
                 else:
                     fields.append((f"`{name}`", type_, text))
     return _page(

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from flockd.campaign.figures import MEASURES
+from flockd.campaign.figures import MEASURES, Figure
 from tools.measure.card import EYES, FIGURES, FIGURES_FILE, ROOT, git
 from tools.measure.labelled import WIDTH_CLASSES
 
@@ -29,6 +29,13 @@ SHORT = ("order_tail", "recall_within_10m", "false_share", "associated_error_med
 """Of README."""
 EACH = ("order_tail", "convergence_time_s", "shape_deviation_tail", "recall_within_10m", "false_share",
         "associated_error_median_m", "associated_error_max_m", "min_distance_after_10s_m")  # fmt: skip
+STAGES = {
+    "scene": "checks of the images; the first network's maps and depth, of every camera",
+    "flow": "optical flow of every camera",
+    "detection": "crops, second stage, suppression, masks",
+    "ego_motion": "the own motion, its scale by the ground, whether each camera agrees with the autopilot",
+}
+WORST = 5
 ENOUGH_FOR_AN_INTERVAL = 10
 
 
@@ -72,29 +79,60 @@ def _named(figure: str) -> str:
     return f"{MEASURES[figure].name}{', ' * bool(MEASURES[figure].unit)}{MEASURES[figure].unit}"
 
 
-def _flights(parts: Mapping[str, Part], scenarios: Iterable[str] | None = None, only: Sequence[str] = FIGURES) -> str:
-    """Median, its interval at 95 % of ten flights and more, and, in brackets, worst: by sight, exact and blind."""
-    part = parts["flights"]
-    tables = []
-    for scenario in scenarios or part:
-        of = part[scenario]
-        rows = [
-            [_named(figure), *(_cell(of[eyes], figure) for eyes in EYES)]
-            for figure in only
-            if any(figure in of[eyes]["figures"] for eyes in EYES)
-        ]
-        count = of["sight"]["flights"] - of["sight"]["failed"]
-        head = f"{scenario}: {count} flight{'s' * (count != 1)} of {of['duration_s']:g} s, median (worst)"
-        table = _table((head, *(f"by {eyes}" if eyes == "sight" else eyes for eyes in EYES)), rows)
-        tables.append(f"{table}\n{_origin(of)}")
-    return "\n\n".join(tables)
+def _readme(parts: Mapping[str, Part]) -> str:
+    """Of the paper's flights: median and, in brackets, worst, by sight, blind and exact."""
+    of = parts["flights"][PAPERS]
+    rows = [[_named(figure), *(_cell(of[eyes], figure) for eyes in EYES)] for figure in SHORT]
+    return _table((f"{_flown(PAPERS, of)}, median (worst)", "by sight", "blind", "exact"), rows) + "\n" + _origin(of)
+
+
+def _flights(parts: Mapping[str, Part]) -> str:
+    """Of every scenario: what each kind of flock reached, then what drones by sight knew of each other."""
+    flights = parts["flights"]
+
+    def known_to(*eyes: str) -> list[Figure]:
+        return [name for name in FIGURES if any(name in of[one]["figures"] for of in flights.values() for one in eyes)]
+
+    reached = known_to("blind", "exact")
+    seen = [name for name in known_to("sight") if name not in reached]
+    of_one = {
+        name: having[0]
+        for name in reached
+        if len(having := [one for one, of in flights.items() if name in of["exact"]["figures"]]) == 1 < len(flights)
+    }
+    columns = [name for name in reached if name not in of_one]
+    rows = [
+        [_flown(scenario, of) if eyes == "sight" else "", eyes, *(_cell(of[eyes], name) for name in columns)]
+        for scenario, of in flights.items()
+        for eyes in EYES
+    ]
+    by_sight = [[scenario, *(_cell(of["sight"], name) for name in seen)] for scenario, of in flights.items()]
+    apart = [
+        f"{_named(name)} ({scenario}): {', '.join(f'{eyes} {_cell(flights[scenario][eyes], name)}' for eyes in EYES)}."
+        for name, scenario in of_one.items()
+    ]
+    origins: dict[str, list[str]] = {}
+    for scenario, of in flights.items():
+        origins.setdefault(_origin(of).strip(), []).append(scenario)
+    return "\n\n".join((
+        _table(("flights", "known by", *map(_named, columns)), rows),
+        *apart,
+        _table(("by sight", *map(_named, seen)), by_sight),
+        *(f"Flown for {'; '.join(scenarios)}: {origin}" for origin, scenarios in origins.items()),
+    ))  # fmt: skip
+
+
+def _flown(scenario: str, of: Part) -> str:
+    """How often it was flown, and for how long."""
+    count = of["sight"]["flights"] - of["sight"]["failed"]
+    return f"{scenario}: {count} flight{'s' * (count != 1)} of {of['duration_s']:g} s"
 
 
 def _each(parts: Mapping[str, Part]) -> str:
-    """Each of the paper's flights by sight, that with the largest shape deviation first."""
+    """The paper's flights by sight with the largest shape deviation."""
     of = parts["flights"][PAPERS]
     worst = sorted(of["sight"]["each"], key=lambda one: -one.get("shape_deviation_tail", math.inf))
-    rows = [[f"{one[figure]:g}" if figure in one else "-" for figure in ("seed", *EACH)] for one in worst]
+    rows = [[f"{one[figure]:g}" if figure in one else "-" for figure in ("seed", *EACH)] for one in worst[:WORST]]
     return _table(("seed", *map(_named, EACH)), rows) + "\n" + _origin(of)
 
 
@@ -141,20 +179,26 @@ def _px4(parts: Mapping[str, Part]) -> str:
 
 
 def _px4_stories(parts: Mapping[str, Part]) -> str:
-    rows = list(parts["px4_stories"]["found"].items())
-    return _table(("story", "with PX4"), rows) + "\n" + _origin(parts["px4_stories"])
+    told: dict[str, list[str]] = {}
+    for story, end in parts["px4_stories"]["found"].items():
+        told.setdefault(end, []).append(story)
+    rows = [(f"{len(stories)} {end}", "; ".join(stories)) for end, stories in told.items()]
+    return _table(("with PX4", "stories"), rows) + "\n" + _origin(parts["px4_stories"])
 
 
 def _step(parts: Mapping[str, Part]) -> str:
     stages = parts["step"]["found"]["profile"]["stages"]
-    rows = [(name, f"{one['p50_ms']:.1f}", f"{one['p95_ms']:.1f}") for name, one in stages.items()]
-    return _table(("stage", "p50, ms", "p95, ms"), rows) + "\n" + _origin(parts["step"])
+    rows = [
+        (f"`{name}`", f"{one['p50_ms']:.1f}", f"{one['p95_ms']:.1f}", STAGES.get(name, ""))
+        for name, one in stages.items()
+    ]
+    return _table(("stage", "p50, ms", "p95, ms", "what it does"), rows) + "\n" + _origin(parts["step"])
 
 
 TABLES: dict[str, Callable[[Mapping[str, Part]], str]] = {
     "flights": _flights,
     "each": _each,
-    "readme": lambda parts: _flights(parts, (PAPERS,), SHORT),
+    "readme": _readme,
     "paper": _paper,
     "encounters": _encounters,
     "pictures": _pictures,

@@ -18,9 +18,9 @@ PURPOSES: Mapping[str, str] = {
     "review": "replay, report",
     "ground": "calibration, doctor",
     "fleet": "page, orders, ROS 2",
-    "onboard": "devices, threads, time",
+    "onboard": "devices, threads",
     "flight": "pure functions",
-    "core": "messages, configuration",
+    "core": "messages, settings",
     "pilot": "FlockPilot.step",
     "mission": "desired velocity",
     "obstacles": "map, way around",
@@ -71,7 +71,7 @@ def _list(title: str, order: Sequence[str], uses: Mapping[str, set[str]], left: 
         kind = "d" if name in flies else "b"
         lines.append(f'  <rect class="{kind}" x="{left}" y="{y}" width="{_BOX}" height="{_ROW - 6}" rx="6"/>')
         lines.append(f'  <text class="n" x="{left + 8}" y="{middle + 5}">{name}</text>')
-        lines.append(f'  <text class="s" x="{left + 98}" y="{middle + 4}">{PURPOSES[name]}</text>')
+        lines.append(f'  <text class="s" x="{left + 108}" y="{middle + 4}">{PURPOSES[name]}</text>')
         for column, other in enumerate(order):
             x = left + _BOX + 16 + column * _COLUMN
             if row == 0:
