@@ -23,9 +23,9 @@ class DetectionParameters(Section):
     """How networks' outputs become detections. What belongs to a network's weights stands in its manifest instead."""
 
     min_range_m: Distance = 0.2
-    """Nearer than this, nothing is a drone: it would touch the own one."""
+    """A detection nearer than this is rejected: the two drones would touch."""
     max_range_m: Distance = 60.0
-    """Farther than this, nothing is a drone: it would be smaller than a pixel or two."""
+    """A detection farther than this is rejected: such a drone would be smaller than a pixel or two."""
     crop_shift: Share = 0.03
     """A further crop is not worth it when it would be moved by less than this share of half its width, ..."""
     crop_resize: Annotated[float, Field(ge=1)] = 1.05
@@ -34,8 +34,8 @@ class DetectionParameters(Section):
     """Two detections are one when their Mahalanobis distance is less: 99 % of pairs of one drone are nearer (chi-square
     of three degrees of freedom)."""
     drone_extent: Share = 0.18
-    """Share of its size by which a drone's centre may be misplaced between two of its detections, as a standard
-    deviation: with the gate, two drones are never nearer to each other than 0.6 of their size."""
+    """Standard deviation of a drone's centre between two of its detections, as a share of its size. With the gate, two
+    drones are never nearer to each other than 0.6 of their size."""
     max_proposals: Annotated[int, Field(ge=1)] = 12
     """The most regions of one image that pass from the first stage to the second: those of the highest score, so that a
     cluttered image does not exceed the deadline. More than the drones that one camera sees."""
@@ -61,12 +61,12 @@ class NoiseParameters(Section):
     max_rough_rise: Share = 0.4
     """The image is not used where the rough share exceeds that of the last half minute by this."""
     max_unexplained: Share = 0.35
-    """The image is not used where the share that does not follow from the image before is larger by this than in the
-    other cameras, as when it is damaged in blocks, or covered by soft noise. 1: all are used."""
+    """The image is not used if a larger share of it than in the other cameras, by this much, cannot be predicted from
+    the image before: it is damaged in blocks, or covered by soft noise. 1: all are used."""
     min_clarity: Share = 0.35
-    """The image is not used where its ground has kept less than this share of the contrast, or of the sharpness, that
-    the camera showed before, and the other cameras did not lose as much: its lens is covered, dirty, fogged or in the
-    sun. 0: all are used."""
+    """The image is not used if its ground has kept less than this share of the contrast or sharpness that the camera
+    showed before, and the other cameras lost less. The lens is then covered, dirty, fogged or in the sun. 0: all are
+    used."""
     clean_images: Annotated[int, Field(ge=1, le=100)] = 2
     """Clean images in a row before a camera that was noisy is used again."""
 

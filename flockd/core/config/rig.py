@@ -13,7 +13,7 @@ from flockd.core.config.base import NonNegative, PlainName, Positive, Section, r
 
 
 class MeasurementConfig(Section):
-    """Where calibrated numbers come from, for people: nothing flies by it. `flockd calibrate` writes it."""
+    """Where calibrated numbers come from, for people; flights do not use it. `flockd calibrate` writes it."""
 
     date: Annotated[str, text(r"^\d{4}-\d{2}-\d{2}$", "a date, as in `2026-11-24`")]
     camera: str

@@ -49,8 +49,8 @@ class GateParameters(Section):
     """From seeing an obstacle until the own drone has begun to brake. Its velocity is expected to follow its setpoints
     with this time constant."""
     neighbour_reaction_s: Annotated[float, Field(ge=0, le=5)] = 1.0
-    """From a neighbour's change of velocity until the own drone has begun to brake: a step of the pilot, in which the
-    change is not seen, how long the step takes, and the drone's response."""
+    """From a neighbour's change of velocity until the own drone begins to brake: the rest of a step, in which the
+    change is not seen, the computation of the next one, and the drone's response."""
     fence_radius_m: Annotated[float, Field(gt=0, le=100_000)] | None = 100.0
     """Around home, level: the drone brakes before it as before an obstacle; beyond it only inward velocity. null: no
     circle."""

@@ -24,17 +24,17 @@ class TrackingParameters(Section):
     """How long an acceleration lasts. The white acceleration noise of the motion model has the spectral density
     acceleration_sigma_m_s2^2 * manoeuvre_time_s (Bar-Shalom, Li & Kirubarajan 2001, section 6.2)."""
     relative_speed_sigma_m_s: Positive = 0.7
-    """Standard deviation an axis of a flock mate's velocity relative to the own drone's, before it is measured, and
-    again some time later: the mate's velocity returns to the own one as fast as its accelerations allow for that."""
+    """Standard deviation, each axis, of the relative velocity of a drone of the same flock before it is measured, and
+    again some time later: its velocity returns to the own one as fast as its accelerations allow."""
     speed_sigma_m_s: Positive = 2.0
-    """Standard deviation of how fast a drone comes that does not fly with the flock; and, an axis, of the velocity of
-    any drone where the own one is not known."""
+    """Standard deviation of the closing speed of a drone outside the flock; and, each axis, of the velocity of any
+    drone while the own velocity is not known."""
     stranger_probability: Probability = 0.2
     """Probability that a newly seen drone, or one that changes its motion, flies on a course of its own; half of it,
     that it brakes to standstill. All motions are followed, and detections weigh them (IMM: Blom & Bar-Shalom 1988)."""
     robust_sigma: Positive = 2.5
-    """Innovations beyond this many standard deviations count less and less; of those of the motion and measurement
-    model 82 % are nearer, of measured velocities 90 % (chi-square with 4 and 3 degrees of freedom)."""
+    """Innovations beyond this many standard deviations have less and less weight. Of those of the motion and
+    measurement model 82 % are nearer, of measured velocities 90 % (chi-square with 4 and 3 degrees of freedom)."""
 
     size_correlation: Probability = 0.3
     """Correlation of the errors of a detection's log range and log size, taken to be equally large: a range is the
@@ -73,8 +73,8 @@ class TrackingParameters(Section):
     """Time constant of the average of the network's drone probabilities over a track; its existence probability is
     multiplied by it."""
     heading_sigma_rad: NonNegative = 0.035
-    """Error of the autopilot's heading, as PX4's magnetometer has it: it turns all neighbours alike about the drone,
-    and lasts, so that it is added where positions are reported, and not in the filter."""
+    """Error of the autopilot's heading, as PX4's magnetometer has it. It turns all neighbours alike about the drone,
+    and lasts: it is added where positions are reported, and not in the filter."""
     confirm_hits: Annotated[int, Field(ge=1)] = 2
     """A track needs this many detections that agree with it to be confirmed; after the first each counts by
     `evidence_interval_s`."""
