@@ -37,7 +37,7 @@ LINES = {
     "tools/training": 4_330,
 }
 """Lines of Python below a folder."""
-FILES = {"flockd": 332}
+FILES = {"flockd": 333}
 NUMBERS_OF_FLIGHT = 270
 """In constants of the modules of `flockd/flight`."""
 SLACK = 0.02

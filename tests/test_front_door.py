@@ -26,6 +26,11 @@ def test_importing_flockd_loads_no_library() -> None:
     assert loaded - sys.stdlib_module_names == {"flockd"}
 
 
+def test_the_package_runs_as_the_program() -> None:
+    done = subprocess.run([sys.executable, "-m", "flockd", "--version"], capture_output=True, text=True, check=True)
+    assert done.stdout.split()[-1] == flockd.__version__
+
+
 @pytest.mark.parametrize("name", flockd.__all__)
 def test_a_name_is_what_its_module_defines(name: str) -> None:
     value = getattr(flockd, name)

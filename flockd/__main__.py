@@ -1,0 +1,5 @@
+"""`python -m flockd`: the same as the installed `flockd`."""
+
+from flockd import program
+
+program()
