@@ -37,8 +37,7 @@ class Requirements:
 
 
 _PROBABILITIES = {
-    "drone_probability": Threshold("A refined proposal below this probability is no drone.", 0.0, 1.0),
-    "expected_drone_probability": Threshold("The same where a track predicts a drone.", 0.0, 1.0),
+    "drone_probability": Threshold("A picture alone shows a drone if it is at least so probable.", 0.0, 1.0),
     "another_crop_probability": Threshold(
         "A proposal up to this probability is refused without another crop.", 0.0, 1.0
     ),

@@ -13,6 +13,9 @@ import numpy as np
 
 from flockd.core.config.tracking import TrackingParameters
 
+_SUREST = 0.999
+"""A network is taken for no surer than this."""
+
 
 def missed(probability: float, in_view: float, weight: float, parameters: TrackingParameters) -> float:
     """After a frame set without a detection of the track, which the cameras show with the probability `in_view`."""
@@ -31,11 +34,20 @@ def averaged(
 ) -> float:
     """The network's probability of a drone, averaged over the track's `hits` detections; `measured` is the newest.
 
-    A wrong network stays wrong from frame to frame: its probabilities are not independent, and Bayes' rule would turn
-    them into certainty. The memory is exponential in time.
+    Log odds are averaged: they are the likelihood ratios of what the network sees, beside that of the place (D. Lerro,
+    Y. Bar-Shalom, "Interacting multiple model tracking with target amplitude feature", IEEE Transactions on Aerospace
+    and Electronic Systems 29(2), 1993). They are not added: a wrong network stays wrong from frame to frame, its
+    probabilities are not independent, and Bayes' rule would turn them into certainty. The memory is exponential in
+    time.
     """
     share = max(1.0 / hits, 1.0 - math.exp(-interval_s / parameters.drone_probability_memory_s))
-    return drone_probability + share * (measured - drone_probability)
+    before, newest = _log_odds(drone_probability), _log_odds(measured)
+    return 1.0 / (1.0 + math.exp(-before - share * (newest - before)))
+
+
+def _log_odds(probability: float) -> float:
+    within = min(max(probability, 1.0 - _SUREST), _SUREST)
+    return math.log(within / (1.0 - within))
 
 
 def _bayes(probability: float, log_likelihood_ratio: float) -> float:

@@ -124,9 +124,11 @@ class PictureDetector:
         observation = perception.observe(frames, VehicleState(0.0, np.eye(3), _UNKNOWN_HEIGHT_M), None, trace=trace)
         if "camera" not in observation.cameras:  # the networks' output was not finite
             return PictureResult((), 0, np.zeros(image.shape[:2], np.uint8))
-        seen = observation.cameras["camera"].labels
-        mask = np.where(np.isin(seen, [one.label for one in observation.detections]), seen, np.uint8(0))
-        found = tuple(self._drone(one, camera, mask, trace.candidates, scale) for one in observation.detections)
+        seen, stage = observation.cameras["camera"].labels, self._networks.second_stage
+        least = 0.0 if stage is None else stage.thresholds.drone
+        sure = [one for one in observation.detections if one.drone_probability >= least]
+        mask = np.where(np.isin(seen, [one.label for one in sure]), seen, np.uint8(0))
+        found = tuple(self._drone(one, camera, mask, trace.candidates, scale) for one in sure)
         return PictureResult(found, sum(proposal.instance is not None for proposal in trace.proposals), mask)
 
     def _drone(

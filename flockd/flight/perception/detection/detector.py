@@ -84,7 +84,7 @@ class Detector:
         trace.proposals += [*proposals, *predicted]
         trace.candidates += candidates
         reasons = (*unpredicted, *cascade.reasons)
-        return _masked(suppress(candidates, self._parameters), scenes, none, reasons)
+        return _masked(suppress(candidates, self._parameters), scenes, none, reasons, stage.thresholds.drone)
 
 
 def _masked(
@@ -92,6 +92,12 @@ def _masked(
     scenes: Mapping[str, SceneMaps],
     rejected: Container[Instance] = (),
     reasons: tuple[Reason, ...] = (),
+    sure: float = 0.0,
 ) -> Detected:
-    masks = {name: first_stage_labels(scene, found.labels_of(name), rejected) for name, scene in scenes.items()}
+    """With the masks of the detections that are at least so probable; pixels of the others are of no class."""
+    of_sure = {one.label for one in found.detections if one.drone_probability >= sure}
+    masks = {}
+    for name, scene in scenes.items():
+        labels = {instance: label for instance, label in found.labels_of(name).items() if label in of_sure}
+        masks[name] = first_stage_labels(scene, labels, rejected)
     return Detected(found.detections, masks, reasons)

@@ -19,6 +19,9 @@ from flockd.flight.perception.detection.second_stage import SecondStage
 from flockd.flight.perception.interface import Networks
 from flockd.flight.perception.maps import Crop, KnownSize, RangeEstimate
 
+LIKELY = 0.5
+"""A proposal that is likelier a drone than not is a candidate: the tracker weighs the probability."""
+
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
@@ -161,20 +164,19 @@ class Cascade:
                 continue
             least[at] = probability
             enough = repeats | (number == self._rules.max_crops)
-            settled[at] = enough & (probability > self._thresholds.drone)  # a mirrored crop would not raise it
+            settled[at] = enough & (probability > LIKELY)  # a mirrored crop would not raise it
             for column, values in zip(shown, estimates, strict=True):
                 column[at] = values
             at = at[~enough]
         at, estimates = self._with_mirrored(of, np.flatnonzero(settled), aims, shown)
         probability = np.minimum(least[at], estimates.drone_probability)
         rejected[at] = probability <= self._thresholds.another_crop
-        needed = [self._thresholds.predicted_drone if one.predicted else self._thresholds.drone for one in of[at]]
-        sure = np.flatnonzero(~rejected[at] & (probability > needed))
+        likely = np.flatnonzero(~rejected[at] & (probability > LIKELY))
         estimates, across = (
-            estimates._replace(drone_probability=probability).take(sure),
+            estimates._replace(drone_probability=probability).take(likely),
             self._thresholds.bearing_sigma_rad,
         )
-        rows = zip(of[at[sure]], estimates.bearing, *(column.tolist() for column in estimates[1:]), strict=True)
+        rows = zip(of[at[likely]], estimates.bearing, *(column.tolist() for column in estimates[1:]), strict=True)
         found = [Candidate(one, bearing, log_r, sigma, across, *rest) for one, bearing, log_r, sigma, *rest in rows]
         return Refined(found, of[rejected].tolist())
 

@@ -15,9 +15,7 @@ class Thresholds:
     """Decision thresholds on the network's outputs. They belong to its weights and stand in its manifest."""
 
     drone: float
-    """Least probability of a detection."""
-    predicted_drone: float
-    """Least probability of a detection where a track was predicted."""
+    """From this probability on, one picture alone shows a drone."""
     another_crop: float
     """A proposal with at most this probability is rejected without another crop."""
     mean_sigma: float
@@ -65,7 +63,6 @@ class SecondStage:
             ),
             thresholds=Thresholds(
                 drone=judge.threshold("drone_probability"),
-                predicted_drone=judge.threshold("expected_drone_probability"),
                 another_crop=judge.threshold("another_crop_probability"),
                 mean_sigma=manifest.threshold("mean_sigma_factor"),
                 min_log_range_sigma=manifest.threshold("min_relative_sigma"),
