@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flockd.core.messages import BoolArray, FloatArray
-from flockd.flight.geometry.robust.kernels import Kernel, Tukey, median, reweighted
+from flockd.flight.geometry.robust.kernels import median, tukey
 
 RELIEF = 0.03
 """Standard deviation of the ground's departure from its plane at the place, relative to the range; it grows with
@@ -39,15 +39,12 @@ class GroundSamples:
 
     def select(self, chosen: BoolArray) -> GroundSamples:
         """The samples of a mask (n,)."""
-        return GroundSamples(self.rays[chosen], self.inverse[chosen], self.offsets[chosen], self.sigma[chosen])
+        return GroundSamples(*(column[chosen] for column in vars(self).values()))
 
     @staticmethod
     def concatenate(parts: list[GroundSamples]) -> GroundSamples:
         """All samples of several."""
-        return GroundSamples(
-            np.concatenate([part.rays for part in parts]), np.concatenate([part.inverse for part in parts]),
-            np.concatenate([part.offsets for part in parts]), np.concatenate([part.sigma for part in parts]),
-        )  # fmt: skip
+        return GroundSamples(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
 
 
 def fit_ground(samples: GroundSamples, height: float, slope: FloatArray, place: FloatArray) -> tuple[float, FloatArray]:
@@ -71,38 +68,15 @@ def fit_ground(samples: GroundSamples, height: float, slope: FloatArray, place: 
         raise ValueError("too little ground is seen to fit a plane")
     ground = samples.select(near)
     spread = np.hypot(ground.sigma, RELIEF * (1.0 + away[near]) * expected[near])
-    rows = _rows(ground) / spread
-    plane, weights = reweighted(
-        lambda weights, _: _fitted(rows, weights),
-        lambda plane: _residuals(ground, plane) / spread,
-        _tukey,
-        np.ones(len(spread)),
-        rounds=ROUNDS,
-    )
+    # A point at inverse range w is on the plane if n . (ray + w offset) = w height: linear in height and slope.
+    x, y, z = (ground.rays + ground.inverse[:, None] * ground.offsets).T
+    rows, weights = np.stack([ground.inverse, -x, -y, z]) / spread, np.ones(len(spread))
+    for _ in range(ROUNDS):
+        products = (rows * weights) @ rows.T
+        height, *rise = np.linalg.solve(products[:3, :3], products[:3, 3]).tolist()
+        normal = np.array([*rise, 1.0])
+        left = (ground.inverse - ground.rays @ normal / (height - ground.offsets @ normal)) / spread
+        weights = tukey(left**2, max(MEDIAN_DEVIATIONS * median(np.abs(left)), 1e-6))
     if (weights > 0.5).mean() < MIN_AGREEING:
         raise ValueError("the ground that is seen is no plane")
-    return float(plane[0]), plane[1:]
-
-
-def _rows(ground: GroundSamples) -> FloatArray:
-    """(4, n): the first three rows times (height, slope) give the last. A point at inverse range w is on the plane if
-    ``n . (ray + w offset) = w height``."""
-    x, y, z = (ground.rays + ground.inverse[:, None] * ground.offsets).T
-    return np.stack([ground.inverse, -x, -y, z])
-
-
-def _fitted(rows: FloatArray, weights: FloatArray) -> FloatArray:
-    """(3,) height and slope."""
-    products = (rows * weights) @ rows.T
-    return np.asarray(np.linalg.solve(products[:3, :3], products[:3, 3]), np.float64)
-
-
-def _residuals(ground: GroundSamples, plane: FloatArray) -> FloatArray:
-    """(n,) residuals of the inverse range."""
-    normal = np.array([plane[1], plane[2], 1.0])
-    left: FloatArray = ground.inverse - ground.rays @ normal / (plane[0] - ground.offsets @ normal)
-    return left
-
-
-def _tukey(left: FloatArray) -> Kernel:
-    return Tukey(max(MEDIAN_DEVIATIONS * median(np.abs(left)), 1e-6))
+    return height, np.array(rise)

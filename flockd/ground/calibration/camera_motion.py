@@ -16,7 +16,7 @@ from flockd.core.messages import FloatArray
 from flockd.flight.geometry.cameras import Camera
 from flockd.flight.geometry.pairs import PointPairs
 from flockd.flight.geometry.rig import RigCamera
-from flockd.flight.geometry.robust.kernels import Cauchy, Kernel, Tukey, median
+from flockd.flight.geometry.robust.kernels import cauchy, median, tukey
 from flockd.flight.geometry.rotations import cross_matrix, crossed, rotation_from_vector
 from flockd.flight.geometry.sightlines import products, times, whitening
 from flockd.flight.geometry.transform import RigidTransform
@@ -227,8 +227,8 @@ def _solved(sights: Sights, start: RigidTransform, together: float) -> CameraMot
         # For a Rayleigh distribution the median is sqrt(2 ln 2) sigma.
         sigma = max(math.sqrt(median(size2) / (2.0 * math.log(2.0))), 1.0)
         fine = fine or number >= _ROUNDS - _FINE_ROUNDS
-        kernel: Kernel = Tukey(_TUKEY_SIGMAS * sigma) if fine else Cauchy(_CAUCHY_SIGMAS * sigma)
-        weights = kernel.weight(size2) / (sigma**2 * together)
+        kernel, scale = (tukey, _TUKEY_SIGMAS) if fine else (cauchy, _CAUCHY_SIGMAS)
+        weights = kernel(size2, scale * sigma) / (sigma**2 * together)
         weighted = (there.jacobian * weights).reshape(7, -1)
         hessian = weighted @ J.T
         slope = weighted @ white.ravel()

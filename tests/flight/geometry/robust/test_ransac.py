@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
 
 import numpy as np
 import pytest
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from flockd.core.messages import BoolArray, FloatArray
 from flockd.flight.geometry import RansacResult, RigidTransform, fit_rigid, ransac_rigid, rotation_angle_deg
-from flockd.flight.geometry.robust.kernels import Cauchy, Tukey
-from flockd.flight.geometry.robust.line import ransac_line
-from flockd.flight.geometry.robust.solver import GaussNewton, NormalEquations, Problem
+from flockd.flight.geometry.robust.kernels import cauchy, tukey
+from flockd.flight.perception.metric_depth import ground_scale
 
 TURN = Rotation.from_euler("ZYX", [10.0, -3.0, 2.0], degrees=True)
 SHIFT = np.array([0.5, -0.1, 0.05])
@@ -162,94 +160,29 @@ def test_a_threshold_that_cannot_double_up_to_its_maximum_is_refused(threshold: 
         ransac_rigid(np.eye(3), np.eye(3), threshold=threshold)
 
 
-# One solver, against solutions from outside: closed forms and SciPy.
+# Robust fits.
 
 
-@dataclass(frozen=True, eq=False)
-class Decay(Problem[FloatArray]):
-    """``y = a exp(-b t)``"""
-
-    t: FloatArray
-    y: FloatArray
-    kernel: Cauchy | None = None
-    longest: float = math.inf
-
-    def residuals(self, state: FloatArray) -> FloatArray:
-        with np.errstate(over="ignore"):
-            left: FloatArray = state[0] * np.exp(-state[1] * self.t) - self.y
-        return left
-
-    def linearise(self, state: FloatArray) -> NormalEquations:
-        left = self.residuals(state)
-        with np.errstate(over="ignore", invalid="ignore"):
-            fall = np.exp(-state[1] * self.t)
-            jacobian = np.stack([fall, -state[0] * self.t * fall], axis=1)
-            return NormalEquations.of(left, jacobian, self.kernel.weight(left**2) if self.kernel else None)
-
-    def move(self, state: FloatArray, step: FloatArray) -> FloatArray:
-        moved: FloatArray = state + step
-        return moved
-
-    def limited(self, step: FloatArray) -> FloatArray:
-        return step * min(1.0, self.longest / max(float(np.abs(step).max()), 1e-300))
+@pytest.mark.parametrize(("kernel", "half"), [(cauchy, 2.0), (tukey, 2.0 * math.sqrt(1.0 - math.sqrt(0.5)))])
+def test_kernels_weigh_as_the_literature_says(kernel: Callable[[FloatArray, float], FloatArray], half: float) -> None:
+    assert kernel(np.array([0.0, half**2]), 2.0) == pytest.approx([1.0, 0.5])
+    assert kernel(np.array([4.0 * 2.0**2]), 2.0)[0] == pytest.approx(0.0 if kernel is tukey else 1.0 / 5.0)
 
 
-T = np.linspace(0.0, 4.0, 40)
-NOISY = 3.0 * np.exp(-0.7 * T) + 0.05 * np.random.default_rng(0).normal(size=40)
-SPOILT = np.where(np.arange(40) % 8 == 3, 6.0, NOISY)
-
-
-@pytest.mark.parametrize(("y", "kernel", "loss"), [(NOISY, None, "linear"), (SPOILT, Cauchy(0.1), "cauchy")])
-def test_the_minimum_is_scipys_with_and_without_a_kernel(y: FloatArray, kernel: Cauchy | None, loss: str) -> None:
-    problem = Decay(T, y, kernel)
-    found = GaussNewton(max_steps=100, tolerance=1e-10).minimise(problem, np.array([2.0, 0.5]))
-    theirs = least_squares(problem.residuals, np.array([3.0, 0.7]), loss=loss, f_scale=0.1, xtol=1e-14, ftol=1e-14)
-    assert found.converged
-    assert found.state == pytest.approx(theirs.x, abs=1e-5)
-    squares = problem.residuals(found.state) ** 2
-    cost = found.equations.cost if kernel is None else 0.1**2 * kernel.loss(squares).sum()
-    assert cost == pytest.approx(2.0 * theirs.cost, rel=1e-6)
-
-
-def test_what_is_no_solution_is_distinguished() -> None:
-    nowhere = np.array([math.nan, 0.5])
-    found = GaussNewton(max_steps=5, tolerance=1e-3).minimise(Decay(T, NOISY), nowhere)
-    assert not found.equations.solvable
-    assert not found.converged
-    # Without any fall a decay's time says nothing of its rate: the matrix is singular.
-    undetermined = Decay(np.zeros(40), NOISY)
-    found = GaussNewton(max_steps=5, tolerance=1e-3, max_condition=1e12).minimise(undetermined, np.array([2.0, 0.5]))
-    assert not found.equations.solvable
-    # With hardly any fall it says next to nothing.
-    for max_condition, solvable in ((1e4, False), (1e12, True)):
-        optimizer = GaussNewton(max_steps=1, tolerance=1e-3, max_condition=max_condition)
-        assert optimizer.minimise(Decay(1e-3 * T, NOISY), np.array([2.0, 0.5])).equations.solvable is solvable
-
-
-@pytest.mark.parametrize(("kernel", "half"), [(Cauchy(2.0), 2.0), (Tukey(2.0), 2.0 * math.sqrt(1.0 - math.sqrt(0.5)))])
-def test_kernels_weigh_as_the_literature_says(kernel: Cauchy | Tukey, half: float) -> None:
-    assert kernel.weight(np.array([0.0, half**2])) == pytest.approx([1.0, 0.5])
-    far = kernel.weight(np.array([4.0 * 2.0**2]))[0]
-    assert far == pytest.approx(0.0 if isinstance(kernel, Tukey) else 1.0 / 5.0)
-
-
-@pytest.mark.parametrize("intercept", [True, False])
-def test_a_line_is_found_although_half_of_the_points_are_wrong(intercept: bool) -> None:
+@pytest.mark.parametrize("shift", [True, False])
+def test_a_line_is_found_although_half_of_the_points_are_wrong(shift: bool) -> None:
     rng = np.random.default_rng(2)
     x = rng.uniform(0.1, 1.0, 500)
-    y = 2.5 * x + (0.3 if intercept else 0.0) + 0.002 * rng.normal(size=500)
+    y = 2.5 * x + (0.3 if shift else 0.0) + 0.002 * rng.normal(size=500)
     y[::2] = rng.uniform(0.0, 3.0, 250)
-    line = ransac_line(x, y, np.full(500, 0.01), intercept=intercept, min_inliers=100, min_inlier_ratio=0.25)
-    assert line is not None
-    assert line.slope == pytest.approx(2.5, abs=0.01)
-    assert line.intercept == pytest.approx(0.3 if intercept else 0.0, abs=0.005)
+    assert ground_scale(x, y, shift=shift) == pytest.approx((2.5, 0.3 if shift else 0.0), abs=0.1)
 
 
 def test_points_without_a_line_have_none() -> None:
     rng = np.random.default_rng(3)
-    x, y, tolerance = rng.uniform(0.0, 1.0, 500), rng.uniform(0.0, 1.0, 500), np.full(500, 0.01)
-    assert ransac_line(x, y, tolerance, intercept=True, min_inliers=100, min_inlier_ratio=0.25) is None
-    few = np.arange(50.0)
-    assert ransac_line(few, few, np.ones(50), intercept=True, min_inliers=100, min_inlier_ratio=0.25) is None
-    falling = np.arange(200.0)
-    assert ransac_line(falling, -falling, np.ones(200), intercept=True, min_inliers=100, min_inlier_ratio=0.25) is None
+    falling, few = np.arange(1.0, 201.0), np.arange(50.0)
+    for x, y in ((rng.uniform(0.0, 1.0, 500), rng.uniform(0.0, 9.0, 500)), (few, few), (falling, 200.0 - falling)):
+        with pytest.raises(ValueError, match="too little flat ground"):
+            ground_scale(x, y, shift=True)
+    with pytest.raises(ValueError, match="too little flat ground"):
+        ground_scale(few[:0], few[:0], shift=True)
