@@ -8,15 +8,13 @@ from dataclasses import dataclass, field
 from flockd.core.choices import ROLES, Role
 from flockd.flight.inference.manifest import Fault, Manifest
 
-
-@dataclass(frozen=True)
-class Threshold:
-    """A threshold on a model's outputs."""
-
-    meaning: str
-    low: float
-    high: float
-    """Bounds of the threshold, both included."""
+Bounds = tuple[float, float]
+"""Least and largest value of a threshold, both included."""
+_PROBABILITY: Bounds = (0.0, 1.0)
+_POSITIVE: Bounds = (1e-6, 1.0)
+_LOGIT: Bounds = (-50.0, 50.0)
+"""Beyond them a float32 probability is 0 or 1."""
+_LIMIT: Bounds = (0.0, 50.0)
 
 
 @dataclass(frozen=True)
@@ -30,22 +28,20 @@ class Requirements:
     optional_inputs: tuple[str, ...] = ()
     columns: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """Required columns of an output (n, k), in any order."""
-    thresholds: Mapping[str, Threshold] = field(default_factory=dict)
+    thresholds: Mapping[str, Bounds] = field(default_factory=dict)
     crop: bool = False
     """Whether the manifest has to define how crops are cut."""
     map_stride: bool = False
 
 
-_PROBABILITIES = {
-    "drone_probability": Threshold("A picture alone shows a drone if it is at least so probable.", 0.0, 1.0),
-    "another_crop_probability": Threshold(
-        "A proposal up to this probability is refused without another crop.", 0.0, 1.0
-    ),
-}
-_LOGIT = (-50.0, 50.0)
-"""Bounds of a threshold that is a logit: beyond them a float32 probability is 0 or 1."""
 _GEOMETRY = ("geometry",)
 """Planes: tangents of the rays right and down, and inverse depth (1/m) of flat ground, 0 where unknown."""
+_OF_CROPS = {
+    "drone_probability": _PROBABILITY,  # from it on one picture alone shows a drone
+    "another_crop_probability": _PROBABILITY,  # up to it a proposal is refused without another crop
+}
+_OF_BOXES = ("centre_right_px", "centre_down_px", "width_px", "height_px", "drone_probability")
+_OF_RANGES = ("log_range_per_focal", "right_px", "down_px", "log_relative_sigma", "drone_logit", "log_apparent_size")
 
 REQUIREMENTS: Mapping[Role, Requirements] = {
     "flow": Requirements(inputs=("first", "second"), outputs=("flow",)),
@@ -55,68 +51,34 @@ REQUIREMENTS: Mapping[Role, Requirements] = {
         outputs=("drone", "offset"),
         optional_inputs=_GEOMETRY,
         thresholds={
-            "proposal_logit": Threshold(
-                "Logit from which pixels make proposals where a second stage refuses those that are no drones.", *_LOGIT
-            ),
-            "proposal_logit_alone": Threshold(
-                "Logit from which pixels are a drone's where there is no second stage.", *_LOGIT
-            ),
+            "proposal_logit": _LOGIT,  # from it pixels make proposals, where a second stage refuses what is no drone
+            "proposal_logit_alone": _LOGIT,  # from it pixels are a drone's, where there is no second stage
         },
         map_stride=True,
     ),
     "detector": Requirements(
         inputs=("image",),
         outputs=("boxes",),
-        columns={"boxes": ("centre_right_px", "centre_down_px", "width_px", "height_px", "drone_probability")},
+        columns={"boxes": _OF_BOXES},
         thresholds={
-            "box_probability": Threshold("A box of less probability is not proposed.", 1e-4, 1.0),
-            "overlap": Threshold(
-                "Of two boxes whose intersection over union is more, the more probable one is kept.", 0.0, 1.0
-            ),
-            "evidence_gain": Threshold(
-                "The log odds of a box count so many times beside those that the second stage says of its crop.",
-                0.0,
-                10.0,
-            ),
-            "large_box_evidence": Threshold(
-                "So much is added to them for a large box, by the logarithm of its width: nothing up to 40 pixels, all "
-                "of it from 300.",
-                *_LOGIT,
-            ),
-            "small_box_evidence": Threshold(
-                "The same for a small one: nothing from 20 pixels on, all of it up to 8.", *_LOGIT
-            ),
-            "no_box_evidence": Threshold(
-                "The log odds that count so for what the segmentation alone proposes.", *_LOGIT
-            ),
-            "distance_logit_limit": Threshold(
-                "Beside a detector, `verification`'s limit of the same name is this.", 0.0, 50.0
-            ),
+            "box_probability": _POSITIVE,  # a box of less is not proposed
+            "overlap": _PROBABILITY,  # of two boxes with a larger intersection over union the more probable one stays
+            "evidence_gain": _LIMIT,  # the weight of a box's log odds beside those of the second stage
+            "large_box_evidence": _LOGIT,  # added to them for a box of 300 pixels and more, nothing up to 40
+            "small_box_evidence": _LOGIT,  # added for a box of 8 pixels and less, nothing from 20 on
+            "no_box_evidence": _LOGIT,  # the log odds of what the segmentation alone proposes
+            "distance_logit_limit": _LIMIT,  # that of `verification`, if there is a detector
         },
     ),
     "distance": Requirements(
         inputs=("crop",),
         outputs=("range",),
-        columns={
-            "range": (
-                "log_range_per_focal",
-                "right_px",
-                "down_px",
-                "log_relative_sigma",
-                "drone_logit",
-                "log_apparent_size",
-            )
-        },
+        columns={"range": _OF_RANGES},
         thresholds={
-            **_PROBABILITIES,
-            "bearing_sigma_rad": Threshold("Standard deviation of a refined bearing, each way.", 1e-6, 1.0),
-            "min_relative_sigma": Threshold("Least standard deviation of a range, as a share of it.", 0.0, 1.0),
-            "mean_sigma_factor": Threshold(
-                "Standard deviation of the mean of the last crop and the mirrored one, as a share of what each says "
-                "of its own.",
-                1e-3,
-                1.0,
-            ),
+            **_OF_CROPS,
+            "bearing_sigma_rad": _POSITIVE,  # standard deviation of a refined bearing, each way
+            "min_relative_sigma": _PROBABILITY,  # least standard deviation of a range, as a share of it
+            "mean_sigma_factor": _POSITIVE,  # that of the mean of two crops, as a share of a single crop's
         },
         crop=True,
     ),
@@ -124,12 +86,8 @@ REQUIREMENTS: Mapping[Role, Requirements] = {
         inputs=("crop",),
         outputs=("drone",),
         columns={"drone": ("drone_logit",)},
-        thresholds={
-            **_PROBABILITIES,
-            "distance_logit_limit": Threshold(
-                "The distance network's logit counts as well, up to this much for or against a drone.", 0.0, 50.0
-            ),
-        },
+        # Up to the limit, the distance network's logit counts as well, for or against a drone.
+        thresholds={**_OF_CROPS, "distance_logit_limit": _LIMIT},
     ),
 }
 """The table that a manifest is checked against. A distance model may give a `mask` (n, h, w) of logits as well."""
@@ -167,12 +125,12 @@ def _faults_of_tensors(manifest: Manifest, role: Role, needed: Requirements) -> 
 
 
 def _faults_of_numbers(manifest: Manifest, role: Role, needed: Requirements) -> Iterator[Fault]:
-    for name, threshold in needed.thresholds.items():
+    for name, (low, high) in needed.thresholds.items():
         value = manifest.thresholds.get(name)
-        limits = f"a number from {threshold.low:g} to {threshold.high:g}"
+        limits = f"a number from {low:g} to {high:g}"
         if value is None:
             yield Fault(("thresholds", name), f"is missing for the role {role}; add it with {limits}")
-        elif not threshold.low <= value <= threshold.high:
+        elif not low <= value <= high:
             yield Fault(("thresholds", name), f"{value:g} is out of range; write {limits}")
     if needed.crop and manifest.crop is None:
         yield Fault(("crop",), f"is missing for the role {role}; add a section that says how crops are cut out")
