@@ -13,7 +13,7 @@ from pydantic import Field
 from flockd.core.choices import Provider
 from flockd.core.config.base import PlainName, Positive, Section, text
 from flockd.core.errors import ModelError
-from flockd.core.messages import Float32Array
+from flockd.core.messages import Float32Array, FloatArray
 
 Unknown = Literal["nothing", "scale", "scale_and_shift"]
 Key = tuple[str | int, ...]
@@ -150,6 +150,15 @@ class CropSpec(Section):
     """A further crop is at most this many times as wide as the one before it, and at least as much narrower."""
     max_crops: Annotated[int, Field(ge=2)]
     """Largest number of crops before the mirrored one: the first and the refined ones."""
+
+    def fitting(self, size_m: FloatArray, range_m: FloatArray) -> FloatArray:
+        """(n,) half angles of crops, rad, that fit objects of known size and range (n,)."""
+        return np.asarray(np.arctan(self.fill * size_m / range_m))
+
+    def bounded(self, half_angle: FloatArray, pixel_angle: FloatArray) -> FloatArray:
+        """(n,) rad, within the bounds. ``pixel_angle`` (n,): rad of a pixel of the image there."""
+        least = np.maximum(half_angle, self.min_half_width_px * pixel_angle)
+        return np.minimum(least, np.radians(self.max_half_angle_deg))
 
 
 class Manifest(Section):

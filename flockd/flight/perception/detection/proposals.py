@@ -14,8 +14,9 @@ import numpy as np
 from flockd.core.config.perception import DetectionParameters
 from flockd.core.messages import FloatArray, Reason, ReasonKind, VehicleState
 from flockd.flight.geometry import Rig, log_polar
+from flockd.flight.inference.manifest import CropSpec
 from flockd.flight.perception.detection.instances import Instance
-from flockd.flight.perception.detection.roi import CropRules, Roi, angles_between, pixel_angles, rois_of_instances
+from flockd.flight.perception.detection.roi import Roi, angles_between, pixel_angles, rois_of_instances
 from flockd.flight.perception.maps import SceneMaps
 from flockd.flight.tracking import Prediction
 
@@ -47,7 +48,7 @@ class Proposal:
 
 
 def propose_instances(
-    rig: Rig, scenes: Mapping[str, SceneMaps], rules: CropRules, parameters: DetectionParameters
+    rig: Rig, scenes: Mapping[str, SceneMaps], rules: CropSpec, parameters: DetectionParameters
 ) -> list[Proposal]:
     """The first stage's instances: in each image those of the highest score; of equal scores the larger."""
     found = []
@@ -65,7 +66,7 @@ def propose_predictions(
     vehicle: VehicleState,
     predictions: Iterable[Prediction],
     detected: Sequence[tuple[FloatArray, float]],
-    rules: CropRules,
+    rules: CropSpec,
 ) -> tuple[list[Proposal], list[Reason]]:
     """Predictions of tracks at which nothing was found, and reasons for those that are left out.
 

@@ -3,46 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from flockd.core.messages import BoolArray, FloatArray
 from flockd.flight.geometry import Rig, RigCamera
+from flockd.flight.inference.manifest import CropSpec
 from flockd.flight.perception.detection.instances import Instance
 
 _BORDER_PX = 2
 """A box this near to the image's border is cut by it: the first stage's maps have two image pixels a pixel."""
-
-
-@dataclass(frozen=True)
-class CropRules:
-    """How crops are cut for a network, by its manifest: as in its training."""
-
-    fill: float
-    """Half of the crop's width over the drone's size, both as seen from the camera."""
-    first_margin: float
-    """Half of the first crop's width over the distance from a box's centre to its farthest corner."""
-    cut_margin: float
-    """The same if the image's border cuts the box: the drone is larger than its visible part."""
-    mirror_scale: float
-    """Width of the mirrored crop over the width that fits the drone."""
-    min_half_width_px: float
-    """Least half width in pixels of the camera's image."""
-    max_half_angle: float
-    max_resize: float
-    """Largest ratio between the widths of successive crops, either way."""
-    max_crops: int
-    """Largest number of crops for one proposal, before the mirrored one."""
-
-    def fitting(self, size_m: FloatArray, range_m: FloatArray) -> FloatArray:
-        """(n,) half angles of crops, rad, that fit drones of known size and range (n,)."""
-        return np.asarray(np.arctan(self.fill * size_m / range_m))
-
-    def bounded(self, half_angle: FloatArray, pixel_angle: FloatArray) -> FloatArray:
-        """(n,) limited to the training's bounds. ``pixel_angle`` (n,): rad of a pixel of the image there."""
-        return np.minimum(np.maximum(half_angle, self.min_half_width_px * pixel_angle), self.max_half_angle)
 
 
 class Roi(NamedTuple):
@@ -54,7 +25,7 @@ class Roi(NamedTuple):
     """rad, from its centre to its borders."""
 
 
-def rois_of_instances(camera: RigCamera, instances: Sequence[Instance], rules: CropRules) -> list[Roi | None]:
+def rois_of_instances(camera: RigCamera, instances: Sequence[Instance], rules: CropSpec) -> list[Roi | None]:
     """Regions around boxes of the first stage; None if the lens images nothing there."""
     if not instances:
         return []

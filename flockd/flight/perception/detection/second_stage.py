@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 from flockd.core.errors import ModelError
 from flockd.flight.inference import Manifest
-from flockd.flight.perception.detection.roi import CropRules
+from flockd.flight.inference.manifest import CropSpec
 
 
 @dataclass(frozen=True)
@@ -30,7 +29,7 @@ class SecondStage:
 
     crop_size: int
     """Width and height of its crops, pixels."""
-    rules: CropRules
+    rules: CropSpec
     thresholds: Thresholds
 
     @classmethod
@@ -51,16 +50,7 @@ class SecondStage:
             raise ModelError(f"model {manifest.name} takes no crops; choose one whose manifest has a section `crop`")
         return cls(
             crop_size=manifest.crop_size_px,
-            rules=CropRules(
-                fill=crop.fill,
-                first_margin=crop.first_margin,
-                cut_margin=crop.cut_margin,
-                mirror_scale=crop.mirror_scale,
-                min_half_width_px=crop.min_half_width_px,
-                max_half_angle=math.radians(crop.max_half_angle_deg),
-                max_resize=crop.max_resize,
-                max_crops=crop.max_crops,
-            ),
+            rules=crop,
             thresholds=Thresholds(
                 drone=judge.threshold("drone_probability"),
                 another_crop=judge.threshold("another_crop_probability"),
