@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,8 +19,8 @@ from flockd.core.messages import (
     IntArray,
     ObstacleRanges,
 )
-from flockd.flight.geometry import Rig, RigCamera, RigidTransform, grid_pixels, inverse_ranges_of_rays
-from flockd.flight.perception.observation import CameraObservation, Observation
+from flockd.flight.geometry import Rig, RigCamera, grid_pixels
+from flockd.flight.perception.observation import Observation
 
 _STRIDE_PX = 4
 """Distance of the pixels used: a trunk of 0.2 m at 10 m is 4 px wide at 222 px per radian."""
@@ -46,8 +45,7 @@ _CERTAIN_SIGMAS = 5.0
 """A triangulated point counts if its inverse range is this many standard deviations above zero, the sky's."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Points:
+class _Points(NamedTuple):
     """Places (3, n) metres, with relative standard deviations of their ranges (n,)."""
 
     places: Float32Array
@@ -56,21 +54,6 @@ class _Points:
     """(n,) whether the point may be an obstacle."""
     classed: BoolArray
     """(n,) whether the point shows the range of sight; an unclassified point has no known place."""
-
-    def where(self, chosen: BoolArray) -> _Points:
-        return _Points(self.places[:, chosen], self.relative_sigma[chosen], self.obstacle[chosen], self.classed[chosen])
-
-    @classmethod
-    def concatenate(cls, parts: Sequence[_Points]) -> _Points:
-        return cls(
-            np.concatenate([part.places for part in parts], axis=1),
-            np.concatenate([part.relative_sigma for part in parts]),
-            np.concatenate([part.obstacle for part in parts]),
-            np.concatenate([part.classed for part in parts]),
-        )
-
-
-_NOTHING = _Points(np.empty((3, 0), np.float32), np.empty(0, np.float32), np.empty(0, bool), np.empty(0, bool))
 
 
 class ObstacleRanging:
@@ -87,7 +70,6 @@ class ObstacleRanging:
             name: camera.camera.pixel_angle(camera.camera.rays(grid_pixels(camera.camera.size, _STRIDE_PX)))
             for name, camera in rig.cameras.items()
         }
-        self._triangulations = {name: _Triangulation(camera) for name, camera in rig.cameras.items()}
         self._bins = 1 + math.ceil(_bin(parameters.range_m))
 
     def ranges(
@@ -99,22 +81,25 @@ class ObstacleRanging:
         autopilot's height zero.
         """
         R_ned_body = observation.vehicle.R_ned_body.astype(np.float32)
-        parts = [_NOTHING]
+        parts = []
         for name, camera in observation.cameras.items():
-            before = None if camera.flow is None else observation.previous
-            origin = R_ned_body @ self._rig.cameras[name].T_body_camera.translation.astype(np.float32)
+            moving = None if camera.flow is None or observation.previous is None else ego
+            mounted = self._rig.cameras[name]
+            origin = R_ned_body @ mounted.T_body_camera.translation.astype(np.float32)
             if camera.depth is not None:
-                places = (R_ned_body @ self._rays[name]) * camera.depth[_GRID, _GRID].ravel() + origin[:, None]
+                depth, labels = camera.depth[_GRID, _GRID].ravel(), camera.labels[_GRID, _GRID].ravel()
+                places = (R_ned_body @ self._rays[name]) * depth + origin[:, None]
                 relative = np.full(places.shape[1], self._parameters.range_sigma, np.float32)
-                labels = camera.labels[_GRID, _GRID].ravel()
                 obstacle = labels == 0
-                if ego is not None and before is not None:
-                    obstacle &= camera.depth[_GRID, _GRID].ravel() > self._flow_shows_m(name, ego)
+                if moving is not None:
+                    obstacle &= depth > self._flow_shows_m(name, moving)
                 parts.append(self._about_level(_Points(places, relative, obstacle, labels != UNCLASSED)))
-            if ego is not None and before is not None:
-                moved = self._triangulations[name].points(ego, before, camera)
-                parts.append(self._about_level(replace(moved, places=R_ned_body @ moved.places + origin[:, None])))
-        return self._nearest(observation, _Points.concatenate(parts), ground)
+            if moving is not None:
+                parts.append(self._about_level(_triangulated(mounted, observation, moving)))
+        if not parts:
+            return ObstacleRanges(observation.time_s, np.full(SECTORS, np.inf), np.zeros(SECTORS), np.zeros(SECTORS))
+        points = _Points._make(np.concatenate(columns, axis=-1) for columns in zip(*parts, strict=True))
+        return self._nearest(observation, points, ground)
 
     def _flow_shows_m(self, name: str, ego: EgoMotion) -> Float32Array:
         """(n,) metres: longest range at which the flow of this motion would show an obstacle in each pixel."""
@@ -125,7 +110,8 @@ class ObstacleRanging:
 
     def _about_level(self, points: _Points) -> _Points:
         """The points in the drone's band of heights, and those that show the range of sight."""
-        return points.where(self._in_band(points.places[2]) | _is_level(*points.places))
+        kept = self._in_band(points.places[2]) | _is_level(*points.places)
+        return _Points._make(column[..., kept] for column in points)
 
     def _in_band(self, down: Float32Array) -> BoolArray:
         """(n,) whether points this far below the drone are in its band of heights."""
@@ -210,42 +196,21 @@ def _medians(sectors: IntArray, values: Float32Array) -> FloatArray:
     return np.where(count > 0, values[order][middle], 0.0).astype(float)
 
 
-class _Triangulation:
-    """Triangulates background points between two images of one camera."""
+def _triangulated(camera: RigCamera, observation: Observation, ego: EgoMotion) -> _Points:
+    """Background points from the flow and the drone's own motion, in level axes.
 
-    def __init__(self, camera: RigCamera) -> None:
-        self._camera = camera
-        width, height = camera.camera.size
-        rows = slice(_STRIDE_PX // 2, height, 2 * _STRIDE_PX)  # every second row of `grid_pixels`
-        self._grid = rows, slice(_STRIDE_PX // 2, width, _STRIDE_PX)
-        row, column = np.mgrid[self._grid].reshape(2, -1)
-        self._pixels = np.stack([column, row], axis=1) + 0.5
-        self._rays = camera.camera.rays(self._pixels)
-        self._down_body = camera.T_body_camera.rotation @ self._rays.T
-
-    def points(self, ego: EgoMotion, before: Observation, now: CameraObservation) -> _Points:
-        """From the flow and the drone's own motion, in body axes, relative to the camera.
-
-        Pixels whose inverse range is not well above that of the sky are left out.
-        """
-        assert now.flow is not None
-        mounted, lens = self._camera.T_body_camera, self._camera.camera
-        between = mounted.inverse() @ RigidTransform(ego.rotation, ego.translation) @ mounted
-        near_level = np.abs(before.vehicle.R_ned_body[2] @ self._down_body) <= _STEEPEST
-        start, p = self._pixels[near_level], self._rays[near_level]
-        end = start + now.flow[self._grid].reshape(-1, 2)[near_level]
-        labels_before = before.cameras[self._camera.name].labels[self._grid].ravel()
-        still = lens.in_image(end) & (labels_before[near_level] == 0)
-        end, p = end[still], p[still]
-        column, row = end.astype(np.int64).T
-        background = now.labels[row, column] == 0
-        end, p = end[background], p[background]
-        ray = lens.rays(end)
-        inverse, baseline = inverse_ranges_of_rays(p, ray, between)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            sigma = _FLOW_SIGMA_PX * lens.pixel_angle(ray) / baseline
-            certain = (baseline > _MIN_BASELINE_M) & (inverse > _CERTAIN_SIGMAS * sigma)
-        places = mounted.rotation @ (ray[certain] / inverse[certain, None]).T
-        relative = (sigma[certain] / inverse[certain]).astype(np.float32)
-        every = np.ones(len(relative), bool)
-        return _Points(places.astype(np.float32), relative, every, every)
+    Those whose inverse range is not well above that of the sky are left out.
+    """
+    size, R_ned_camera = camera.camera.size, observation.vehicle.R_ned_body @ camera.T_body_camera.rotation
+    pixels = grid_pixels(size, _STRIDE_PX)
+    pixels = pixels[pixels[:, 1] // _STRIDE_PX % 2 == 0]  # every second row
+    rays, inverse, baseline = observation.inverse_ranges(camera, pixels, ego)
+    down = rays @ R_ned_camera[2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        sigma = _FLOW_SIGMA_PX * camera.camera.pixel_angle(rays) / baseline
+        certain = (baseline > _MIN_BASELINE_M) & (inverse > _CERTAIN_SIGMAS * sigma) & (np.abs(down) <= _STEEPEST)
+    places = R_ned_camera @ (rays[certain] / inverse[certain, None]).T
+    places += (observation.vehicle.R_ned_body @ camera.T_body_camera.translation)[:, None]
+    relative = (sigma[certain] / inverse[certain]).astype(np.float32)
+    every = np.ones(len(relative), bool)
+    return _Points(places.astype(np.float32), relative, every, every)

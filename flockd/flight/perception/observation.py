@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from flockd.core.messages import Detection, Float32Array, Reason, UInt8Array, VehicleState
-from flockd.flight.geometry import RangeMap
+import numpy as np
+
+from flockd.core.messages import Detection, EgoMotion, Float32Array, FloatArray, Reason, UInt8Array, VehicleState
+from flockd.flight.geometry import RangeMap, RigCamera, RigidTransform, inverse_ranges_of_rays
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,3 +53,25 @@ class Observation:
         if self.previous is None:
             raise ValueError("a single observation has no interval")
         return self.time_s - self.previous.time_s
+
+    def inverse_ranges(
+        self, camera: RigCamera, start: FloatArray, ego: EgoMotion
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Of background points at pixels (n, 2) of the image before: unit vectors (m, 3) to those of them that are
+        background now too, in the camera's axes; inverse ranges (m,), 1/m; and baselines (m,) across the rays, m.
+
+        By the flow of this camera, which has to be there, and the drone's own motion. NaN outside a lens's image.
+        """
+        now, before, lens = self.cameras[camera.name], self.previous, camera.camera
+        assert before is not None
+        assert now.flow is not None
+        column, row = start.astype(np.int64).T
+        end = start + now.flow[row, column]
+        still = np.flatnonzero(lens.in_image(end) & (before.cameras[camera.name].labels[row, column] == 0))
+        start, end = start.take(still, axis=0), end.take(still, axis=0)
+        column, row = end.astype(np.int64).T
+        background = np.flatnonzero(now.labels[row, column] == 0)
+        mount = camera.T_body_camera
+        between = mount.inverse() @ RigidTransform(ego.rotation, ego.translation) @ mount
+        rays = lens.rays(end.take(background, axis=0))
+        return rays, *inverse_ranges_of_rays(lens.rays(start.take(background, axis=0)), rays, between)

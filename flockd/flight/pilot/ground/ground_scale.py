@@ -13,19 +13,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from flockd.core.messages import EgoMotion, Float32Array, FloatArray, GroundEstimate
-from flockd.flight.geometry import (
-    GroundSamples,
-    Rig,
-    RigCamera,
-    RigidTransform,
-    fit_ground,
-    grid_pixels,
-    inverse_ranges_of_rays,
-)
+from flockd.core.messages import EgoMotion, FloatArray, GroundEstimate
+from flockd.flight.geometry import GroundSamples, Rig, RigCamera, fit_ground, grid_pixels
 from flockd.flight.geometry.ego_motion_refinement import FLOW_SIGMA_PX
 from flockd.flight.geometry.ground_fit import REACH
-from flockd.flight.perception import CameraObservation, Observation
+from flockd.flight.perception import Observation
 
 MATCHES = 1200
 """Matched points of each image; four times as many did not improve the scale. At 640x480 pixels, these are the points
@@ -50,11 +42,7 @@ def scaled_by_ground(
     """
     if ground.source != "range_finder":
         raise ValueError("no range to the ground")
-    samples = [
-        _samples(rig.cameras[name], observation, camera, flow, ego)
-        for name, camera in observation.cameras.items()
-        if (flow := camera.flow) is not None
-    ]
+    samples = [_samples(rig.cameras[name], observation, ego) for name in observation.flows]
     if not samples:
         raise ValueError("no camera has both frames")
     seen = GroundSamples.concatenate(samples)
@@ -66,25 +54,12 @@ def scaled_by_ground(
     return replace(ego, translation=ego.translation * (height_m / height)), slope
 
 
-def _samples(
-    camera: RigCamera, observation: Observation, now: CameraObservation, flow: Float32Array, ego: EgoMotion
-) -> GroundSamples:
+def _samples(camera: RigCamera, observation: Observation, ego: EgoMotion) -> GroundSamples:
     """Matched background points of one camera, at their places in the newest image."""
-    assert observation.previous is not None
-    labels_before = observation.previous.cameras[camera.name].labels
     width, height = camera.camera.size
     start = grid_pixels(camera.camera.size, max(math.isqrt(width * height // MATCHES), 1))
-    column, row = start.astype(np.int64).T
-    end = start + flow[row, column]
-    used = np.flatnonzero(camera.camera.in_image(end) & (labels_before[row, column] == 0))
-    start, end = start.take(used, axis=0), end.take(used, axis=0)
-    column, row = end.astype(np.int64).T
-    background = np.flatnonzero(now.labels[row, column] == 0)
-    start, end = start.take(background, axis=0), end.take(background, axis=0)
+    seen, inverse, baseline = observation.inverse_ranges(camera, start, ego)
     R_ned_body, mount = observation.vehicle.R_ned_body, camera.T_body_camera
-    between = mount.inverse() @ RigidTransform(ego.rotation, ego.translation) @ mount
-    seen = camera.camera.rays(end)
-    inverse, baseline = inverse_ranges_of_rays(camera.camera.rays(start), seen, between)
     rays = seen @ (R_ned_body @ mount.rotation).T
     clear = (baseline > MIN_BASELINE_M) & (inverse > 0.0)  # NaN compares false
     offsets = np.broadcast_to(R_ned_body @ mount.translation, rays.shape)
