@@ -1,7 +1,7 @@
 """Camera models, rigid fits, Algorithm 1, ego- and neighbour motion. Pure and deterministic: no clock, no files."""
 
 from flockd.flight.geometry.cameras import Camera, PinholeCamera, WideAngleCamera
-from flockd.flight.geometry.depth_maps import RangeMap, ZMap, blind_pixels, range_map, z_map
+from flockd.flight.geometry.depth_maps import RangeMap, ZMap, range_map, z_map
 from flockd.flight.geometry.ego_motion import estimate_ego_motion, moved_pixels
 from flockd.flight.geometry.ego_motion_refinement import refine_ego_motion
 from flockd.flight.geometry.ground import ground_inverse_depth
@@ -38,7 +38,6 @@ __all__ = [
     "VirtualCrops",
     "WideAngleCamera",
     "ZMap",
-    "blind_pixels",
     "build_rig",
     "estimate_ego_motion",
     "euler_from_rotation",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import ClassVar
 
 import numpy as np
@@ -70,6 +70,13 @@ class Camera(ABC):
         """Points (n, 3) at ``range_m`` (n,) metres along the rays of pixels (n, 2) (Eq. 6); NaN where `rays` is."""
         points: FloatArray = self.rays(pixels) * np.asarray(range_m, dtype=np.float64)[:, None]
         return points
+
+    @lru_cache(maxsize=64)  # noqa: B019 - cameras are few, and live as long as the process
+    def block_rays(self, stride: int) -> FloatArray:
+        """(h / stride, w / stride, 3) unit vectors along the rays of blocks' centres, NaN as in `rays`; read only."""
+        width, height = (length // stride for length in self.size)
+        middles = np.indices((height, width), np.float64)[::-1].reshape(2, -1).T + 0.5
+        return self.rays(np.asarray(stride * middles, np.float64)).reshape(height, width, 3)
 
     def in_image(self, pixels: FloatArray) -> BoolArray:
         """Mask (n,): which pixels (n, 2) lie inside the image; false for NaN."""

@@ -7,7 +7,7 @@ from typing import NewType
 
 import numpy as np
 
-from flockd.core.messages import BoolArray, Float32Array
+from flockd.core.messages import Float32Array
 from flockd.flight.geometry.cameras import Camera
 
 ZMap = NewType("ZMap", Float32Array)
@@ -29,16 +29,5 @@ def z_map(ranges: RangeMap, camera: Camera) -> ZMap:
 @lru_cache(maxsize=32)
 def _axial_share(camera: Camera) -> Float32Array:
     """(h, w) z over range of each pixel; NaN outside the lens's image, or if it is not positive."""
-    width, height = camera.size
-    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    share = camera.rays(np.stack([u.ravel(), v.ravel()], axis=1))[:, 2].reshape(height, width)
+    share = camera.block_rays(1)[..., 2]
     return np.where(share > 0.0, share, np.nan).astype(np.float32)
-
-
-@lru_cache(maxsize=64)
-def blind_pixels(camera: Camera, stride: int = 1) -> BoolArray:
-    """(h / stride, w / stride) mask of the blocks whose centres the lens does not image."""
-    width, height = camera.size
-    u, v = np.meshgrid(np.arange(0, width, stride) + stride / 2.0, np.arange(0, height, stride) + stride / 2.0)
-    rays = camera.rays(np.stack([u.ravel(), v.ravel()], axis=1))
-    return np.isnan(rays[:, 0]).reshape(u.shape)

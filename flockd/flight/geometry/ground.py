@@ -41,7 +41,5 @@ def _rays_of_unit_depth(camera: RigCamera, stride: int) -> Float32Array:
     width, height = camera.camera.size
     if stride < 1 or width % stride or height % stride:
         raise ValueError(f"a stride of {stride} does not divide an image of {width}x{height}")
-    u, v = np.meshgrid(np.arange(0, width, stride) + stride / 2.0, np.arange(0, height, stride) + stride / 2.0)
-    rays = camera.camera.rays(np.stack([u.ravel(), v.ravel()], axis=1))
-    points = rays / np.where(rays[:, 2:] > 0.0, rays[:, 2:], np.nan)
-    return points.reshape(*u.shape, 3).astype(np.float32)
+    rays = camera.camera.block_rays(stride)
+    return (rays / np.where(rays[..., 2:] > 0.0, rays[..., 2:], np.nan)).astype(np.float32)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 
+import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -37,53 +38,14 @@ def euler_from_rotation(rotation: FloatArray) -> tuple[float, float, float]:
 
 def rotation_from_vector(vector: FloatArray) -> FloatArray:
     """(3, 3) rotation about the direction of ``vector`` (3,) by its length in radians; (n, 3, 3) of (n, 3)."""
-    if np.ndim(vector) == 1:
-        return _rotation(*(float(part) for part in vector))
+    if np.ndim(vector) == 1:  # scipy is several times slower for a single one
+        return np.asarray(cv2.Rodrigues(np.asarray(vector, np.float64))[0], np.float64)
     return np.asarray(Rotation.from_rotvec(vector).as_matrix())
-
-
-def _rotation(x: float, y: float, z: float) -> FloatArray:
-    """Rodrigues' formula: fits compute hundreds of single rotations a step, and scipy is seven times slower for one."""
-    angle = math.sqrt(x * x + y * y + z * z)
-    if not math.isfinite(angle):
-        return np.full((3, 3), np.nan)
-    # sin(a) / a and (1 - cos(a)) / a^2, with the limits 1 and 1/2.
-    a = math.sin(angle) / angle if angle > 0.0 else 1.0
-    b = 2.0 * (math.sin(angle / 2.0) / angle) ** 2 if angle > 0.0 else 0.5
-    c = math.cos(angle)
-    return np.array(
-        [
-            [c + b * x * x, b * x * y - a * z, b * x * z + a * y],
-            [b * x * y + a * z, c + b * y * y, b * y * z - a * x],
-            [b * x * z - a * y, b * y * z + a * x, c + b * z * z],
-        ]
-    )
 
 
 def vector_from_rotation(rotation: FloatArray) -> FloatArray:
     """The inverse of `rotation_from_vector`: (3,) of a (3, 3) rotation, (n, 3) of (n, 3, 3)."""
-    if rotation.ndim == 2:
-        return _vector(rotation)
     return np.asarray(Rotation.from_matrix(rotation).as_rotvec())
-
-
-def _vector(rotation: FloatArray) -> FloatArray:
-    """By the largest component of the quaternion (Shepperd 1978): scipy is ten times slower for a single one."""
-    (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
-    parts = 1.0 + a + e + i, 1.0 + a - e - i, 1.0 - a + e - i, 1.0 - a - e + i
-    largest = max(parts)
-    if largest == parts[0]:
-        w, x, y, z = largest, h - f, c - g, d - b
-    elif largest == parts[1]:
-        w, x, y, z = h - f, largest, b + d, c + g
-    elif largest == parts[2]:
-        w, x, y, z = c - g, b + d, largest, f + h
-    else:
-        w, x, y, z = d - b, c + g, f + h, largest
-    sine = math.sqrt(x * x + y * y + z * z)
-    angle = 2.0 * math.atan2(sine, abs(w))
-    scale = math.copysign(angle / sine, w) if sine > 0.0 else 0.0
-    return np.array([scale * x, scale * y, scale * z])
 
 
 def rotation_from_quaternion(quaternion: FloatArray) -> FloatArray:

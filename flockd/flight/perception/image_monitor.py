@@ -35,7 +35,7 @@ import numpy as np
 
 from flockd.core.config.perception import NoiseParameters
 from flockd.core.messages import Float32Array, FloatArray, Reason, ReasonKind, UInt8Array
-from flockd.flight.geometry import RigCamera, grid_pixels
+from flockd.flight.geometry import RigCamera
 
 _BLOCK_PX = 32
 _SIGMA_PER_MEAN = math.sqrt(math.pi / 2)
@@ -168,7 +168,10 @@ class ImageMonitor:
 
     def __init__(self, cameras: Mapping[str, RigCamera], parameters: NoiseParameters) -> None:
         self._parameters = parameters
-        self._cameras = {name: _Camera(_block_rays(camera)) for name, camera in cameras.items()}
+        self._cameras = {
+            name: _Camera(camera.camera.block_rays(_BLOCK_PX) @ camera.T_body_camera.rotation.T)
+            for name, camera in cameras.items()
+        }
         self._R_ned_body: FloatArray = np.eye(3)
 
     def faults(self, images: Mapping[str, UInt8Array], time_s: float, R_ned_body: FloatArray) -> dict[str, Reason]:
@@ -290,10 +293,3 @@ def _pixels(width: int, height: int) -> Float32Array:
 def _median(values: list[float]) -> float:
     ordered, middle = sorted(values), len(values) // 2
     return (ordered[middle] + ordered[~middle]) / 2.0
-
-
-def _block_rays(camera: RigCamera) -> FloatArray:
-    columns, rows = (length // _BLOCK_PX for length in camera.camera.size)
-    middles = grid_pixels((columns, rows), 1) * _BLOCK_PX
-    rays = camera.camera.rays(middles) @ camera.T_body_camera.rotation.T
-    return rays.reshape(rows, columns, 3)

@@ -14,7 +14,7 @@ from flockd.core.choices import Role
 from flockd.core.config.perception import NO_MODEL, PerceptionConfig
 from flockd.core.errors import ModelError
 from flockd.core.messages import Float32Array, FloatArray, Frame, UInt8Array
-from flockd.flight.geometry import RigCamera, ZMap, blind_pixels
+from flockd.flight.geometry import RigCamera, ZMap
 from flockd.flight.inference.checks import Deadline, no_deadline
 from flockd.flight.inference.fitting import fit
 from flockd.flight.inference.manifest import Unknown
@@ -95,9 +95,7 @@ class OnnxNetworks(OneByOne):
         if self._segmentation is not self._depth:
             maps = self._run(self._segmentation, frame.image, planes)
         logit = self._at_map_stride(maps["drone"], (width, height))[0]
-        blind = blind_pixels(camera.camera, self.map_stride)
-        if blind.any():
-            logit = np.where(blind, _NO_DRONE_LOGIT, logit)
+        logit = np.where(np.isnan(camera.camera.block_rays(self.map_stride)[..., 0]), _NO_DRONE_LOGIT, logit)
         offset = self._at_map_stride(maps["offset"], (width, height))
         # A second stage rejects false proposals, so the first may propose more.
         threshold = self._segmentation.manifest.threshold
@@ -334,9 +332,6 @@ def geometry_planes(camera: RigCamera, ground: Float32Array | None, stride: int)
 @lru_cache(maxsize=32)
 def _ray_tangents(camera: RigCamera, stride: int) -> Float32Array:
     """(2, h / stride, w / stride) tangents of the rays of the blocks' centres, right and down from the optical axis."""
-    width, height = camera.camera.size
-    u, v = np.meshgrid(np.arange(stride / 2, width, stride), np.arange(stride / 2, height, stride))
-    rays = camera.camera.rays(np.stack([u.ravel(), v.ravel()], 1))
-    rays[np.isnan(rays[:, 0])] = 0.0  # outside the lens's image
-    tangents = rays[:, :2] / np.maximum(rays[:, 2:], _MIN_RAY_Z)
-    return np.ascontiguousarray(tangents.T.reshape(2, *u.shape), dtype=np.float32)
+    rays = np.nan_to_num(camera.camera.block_rays(stride))  # outside the lens's image
+    tangents = rays[..., :2] / np.maximum(rays[..., 2:], _MIN_RAY_Z)
+    return np.ascontiguousarray(tangents.transpose(2, 0, 1), dtype=np.float32)
