@@ -28,6 +28,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 from functools import lru_cache
+from statistics import median
 from typing import NamedTuple
 
 import cv2
@@ -200,7 +201,7 @@ class ImageMonitor:
             camera.last = None if verdicts[name] else now.small
         for name, share in unexplained.items():
             others = [other for camera, other in unexplained.items() if camera != name]
-            if others and share - _median(others) > self._parameters.max_unexplained:
+            if others and share - median(others) > self._parameters.max_unexplained:
                 verdicts[name] = _Fault.DAMAGE
         kept = {name: self._kept(now, self._cameras[name]) for name, now in shown.items() if not verdicts[name]}
         for name, own in kept.items():
@@ -208,7 +209,7 @@ class ImageMonitor:
             counts_as_bad = self._cameras[name].fault is _Fault.LENS
             limit = self._parameters.min_clarity * (_GOOD_AGAIN if counts_as_bad else 1.0)
             limit *= min(self._cameras[name].remembered_s / _KNOWN_S, 1.0)
-            usual = min(_median(others), 1.0) if others else 1.0
+            usual = min(median(others), 1.0) if others else 1.0
             lost = own is not None and own < limit * usual and usual > _ALL_LOST
             if counts_as_bad if shown[name].clarity is None else lost:
                 verdicts[name] = _Fault.LENS
@@ -288,8 +289,3 @@ def unexplained_share(before: UInt8Array, now: UInt8Array) -> float:
 def _pixels(width: int, height: int) -> Float32Array:
     """(2, height, width) columns and rows."""
     return np.indices((height, width), np.float32)[::-1]
-
-
-def _median(values: list[float]) -> float:
-    ordered, middle = sorted(values), len(values) // 2
-    return (ordered[middle] + ordered[~middle]) / 2.0
