@@ -15,7 +15,7 @@ from flockd.sim.flock.exact_states import ExactFlock
 from flockd.sim.scenario import CameraFaultConfig, ScenarioConfig, StartConfig
 from flockd.sim.vehicles.vehicles import Vehicles
 from tests.make import changed
-from tests.sim.flock.test_encounters import ENCOUNTER
+from tests.sim.flock.test_encounters import ENCOUNTER, MISSED
 
 pytestmark = pytest.mark.fault("blind-sector")
 
@@ -33,7 +33,8 @@ def scenario(speed_m_s: float, hovers_at: tuple[float, float], seed: int, faults
         StartConfig(position_m=(*hovers_at, -5.0), mission=MissionParameters(kind="hover"), by_hand=True),
     )
     lost = tuple(CameraFaultConfig(drone=1, camera=camera, begin_s=LOST_S) for camera in faults)
-    return changed(ENCOUNTER, vehicles=vehicles, seed=seed, faults=lost, detections__range_m=SEEN_M)
+    seen = {"detections__missed": MISSED} if speed_m_s > 1.5 else {}
+    return changed(ENCOUNTER, vehicles=vehicles, seed=seed, faults=lost, detections__range_m=SEEN_M, **seen)
 
 
 def flown(flight: ScenarioConfig) -> tuple[FloatArray, float]:
