@@ -26,7 +26,7 @@ def fit_rigid(source: FloatArray, target: FloatArray, weights: FloatArray | None
         raise ValueError("weights must be finite and not negative, and some must be positive")
     weights = weights / weights.sum()
     for name, points in (("source", source), ("target", target)):
-        require_spread(name, points, weights)
+        _require_spread(name, points, weights)
     rotations, translations = kabsch(source[None], target[None], weights)
     return RigidTransform(rotations[0], translations[0])
 
@@ -66,10 +66,8 @@ def _rotations(covariances: FloatArray) -> FloatArray:
     return rotations
 
 
-def require_spread(name: str, points: FloatArray, weights: FloatArray | None = None) -> None:
+def _require_spread(name: str, points: FloatArray, weights: FloatArray) -> None:
     """Raises ValueError if points (n, 3) with weights (n,), which sum to 1, coincide or are collinear."""
-    if weights is None:
-        weights = np.full(len(points), 1.0 / len(points))
     centred = points - weights @ points
     spread = np.sqrt(np.maximum(np.linalg.eigvalsh((centred * weights[:, None]).T @ centred), 0.0))
     scale = max(float(np.abs(points).max()), 1e-9)

@@ -428,16 +428,6 @@ def test_a_detection_is_turned_into_level_axes() -> None:
     assert (measurement.drone_probability, measurement.size_m, measurement.log_size_sigma) == (0.95, 0.6, 0.08)
 
 
-def test_a_position_is_measured_in_range_and_bearing() -> None:
-    """5 m to the east: 10 cm are 2 % of the range, whose logarithm they move by 0.02."""
-    measurement = Measurement.of_position(5.0 * EAST, range_sigma_m=0.1, bearing_sigma_rad=0.01, size_m=0.6)
-    np.testing.assert_allclose(measurement.position, 5.0 * EAST, atol=1e-12)
-    np.testing.assert_allclose(measurement.covariance, np.diag([0.0001, 0.0004, 0.0001]), atol=1e-12)
-    assert (measurement.size_m, measurement.drone_probability) == (0.6, 1.0)
-    with pytest.raises(ValueError, match="bearing"):
-        Measurement.of_position(np.zeros(3), range_sigma_m=0.1, bearing_sigma_rad=0.01, size_m=0.6)
-
-
 def test_probabilities_that_do_not_increase_are_refused() -> None:
     with pytest.raises(ValueError, match="keep_probability"):
         TrackingParameters(keep_probability=0.9, confirm_probability=0.8)

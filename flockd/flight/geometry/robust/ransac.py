@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flockd.core.messages import BoolArray, FloatArray, IntArray
-from flockd.flight.geometry.rigid_fit import checked_pairs, fit_rigid
-from flockd.flight.geometry.rotations import crossed
+from flockd.flight.geometry.rigid_fit import checked_pairs, fit_rigid, kabsch
 from flockd.flight.geometry.transform import RigidTransform
 
 _RESELECTIONS = 10
@@ -76,36 +75,16 @@ def ransac_rigid(
 def _hypotheses(
     source: FloatArray, target: FloatArray, count: int, random: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Motions (b, 3, 3), (b, 3) that fit random triples best (Eq. 18-20), without collinear triples.
-
-    Three points are in a plane. The best motion takes one triangle's plane to the other's, and rotates within it.
-    """
-    corners = np.stack([source.T, target.T], axis=1)[:, :, _random_triples(len(source), count, random).T]
+    """Motions (b, 3, 3), (b, 3) that fit random triples best (Eq. 18-20), without collinear triples."""
+    triples = _random_triples(len(source), count, random)
+    corners = np.stack([source[triples], target[triples]])
     a, b = corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0]
-    normal = crossed(a, b)
-    (a2, b2, c2, doubled_area2) = (np.einsum("ijk,ijk->jk", one, one) for one in (a, b, a - b, normal))
-    wide = (np.sqrt(doubled_area2) > _FLAT_TRIANGLE * np.maximum(np.maximum(a2, b2), c2)).all(axis=0)
+    longest2 = np.maximum.reduce([(side**2).sum(axis=-1) for side in (a, b, a - b)])
+    doubled_area = np.linalg.norm(np.cross(a, b), axis=-1)
+    wide = (doubled_area > _FLAT_TRIANGLE * longest2).all(axis=0)
     if not wide.any():
         raise ValueError("the points are collinear: no three of those drawn span a triangle")
-    with np.errstate(divide="ignore", invalid="ignore"):  # of collinear triples
-        length, axes = np.sqrt(a2), np.empty((3, *a.shape))
-        axes[0], axes[2] = a / length, normal / np.sqrt(doubled_area2)
-        axes[1] = crossed(axes[2], axes[0])
-        # The corners in the planes' axes, relative to their centroids.
-        x, y = np.zeros((2, 3, *length.shape))
-        x[1], x[2], y[2] = length, np.einsum("ijk,ijk->jk", b, axes[0]), np.einsum("ijk,ijk->jk", b, axes[1])
-        x, y = x - (x[1] + x[2]) / 3.0, y - y[2] / 3.0
-        (x_source, x_target), (y_source, y_target) = x.transpose(1, 0, 2), y.transpose(1, 0, 2)
-        cosine = (x_target * x_source + y_target * y_source).sum(axis=0)
-        sine = (y_target * x_source - x_target * y_source).sum(axis=0)
-        size = np.hypot(cosine, sine)
-        cosine, sine = cosine / size, sine / size
-    (first, second, _), turned = axes[:, :, 1], axes[:, :, 1].copy()
-    turned[0], turned[1] = cosine * first + sine * second, cosine * second - sine * first
-    rotations = turned.transpose(2, 1, 0) @ axes[:, :, 0].transpose(2, 0, 1)
-    middle_source, middle_target = (corners[:, :, 0] + (a + b) / 3.0).transpose(1, 2, 0)
-    translations = middle_target - np.einsum("bij,bj->bi", rotations, middle_source)
-    return rotations[wide], translations[wide]
+    return kabsch(corners[0, wide], corners[1, wide], np.full(3, 1.0 / 3.0))
 
 
 def _random_triples(n: int, count: int, random: np.random.Generator) -> IntArray:
