@@ -111,6 +111,7 @@ KEYS: Mapping[str, str] = {
     "safety.gate.max_drift_m_s": "delete it: wind is left to the autopilot",
     "tracking.first_acceleration_sigma_m_s2": "delete it: each neighbour may begin to manoeuvre harder at any time",
     "tracking.hiding_stranger_probability": "delete it: what has a missed neighbour's bearing and size is it, at first",
+    "tracking.size_correlation": "delete it: errors of range and size count as independent",
     "tracking.own_manoeuvre_memory_s": "delete it: each neighbour may begin to manoeuvre harder at any time",
     "take_off_apart_s": "delete it: simulated drones take off together",
     "safety.gate.response_s": "delete it, and write `reaction_s`, which contains it",

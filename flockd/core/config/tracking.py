@@ -36,11 +36,6 @@ class TrackingParameters(Section):
     """Innovations beyond this many standard deviations have less and less weight. Of those of the motion and
     measurement model 82 % are nearer, of measured velocities 90 % (chi-square with 4 and 3 degrees of freedom)."""
 
-    size_correlation: Probability = 0.3
-    """Correlation of the errors of a detection's log range and log size, taken to be equally large: a range is the
-    size, estimated from the appearance, over the apparent size. Measured as 0.2 with drones of families that the
-    shipped networks know and 0.9 with others; taken low, so that ranges count as uncertain as the networks say they
-    are."""
     range_error_time_s: Duration = 1.5
     """How long errors of one neighbour's log ranges last. With the shipped networks' detections in the simulator the
     correlation of errors that are 0.5, 1, 2 and 4 s apart is 0.53, 0.38, 0.21 and 0.09 ..."""

@@ -39,35 +39,29 @@ class Measurements:
     log_size: FloatArray
     lasting: FloatArray
     """Standard deviation of the persistent part of a log range's error."""
-    lasting_size: FloatArray
-    """Standard deviation of the log size's error that goes with it."""
     noise: FloatArray
-    """(..., 4, 4) covariance of the independent part of the error, in log-polar coordinates and log size. A range is a
-    size over an apparent size, so both err together, with correlation `size_correlation`. The error of the size itself
-    (`Detection.log_size_sigma`) is left out because it persists. A filter that took it for noise would derive the range
-    from the neighbour's motion, which does not show it in a flock (`pilot.size_learner`)."""
+    """(..., 4, 4) covariance of the independent part of the error, in log-polar coordinates and log size. The error of
+    the size itself (`Detection.log_size_sigma`) is left out because it persists. A filter that took it for noise would
+    derive the range from the neighbour's motion, which does not show it in a flock (`pilot.size_learner`)."""
 
     @classmethod
     def of(cls, measurements: Sequence[Measurement], parameters: TrackingParameters) -> Measurements:
         """(n, 1): each measurement is compared with all motions of a track."""
-        count, correlation = len(measurements), parameters.size_correlation
+        count = len(measurements)
         bearing = np.array([m.bearing for m in measurements]).reshape(count, 3)
         variance = np.array([m.log_range_variance for m in measurements])
         lasting = parameters.range_error_lasts * variance
-        noise = np.empty((count, 4, 4))
+        noise = np.zeros((count, 4, 4))
         noise[:, :3, :3] = np.array([m.covariance for m in measurements]).reshape(count, 3, 3)
         noise[:, :3, :3] -= lasting[:, None, None] * bearing[:, :, None] * bearing[:, None]
-        noise[:, :3, 3] = noise[:, 3, :3] = (correlation * (variance - lasting))[:, None] * bearing
-        noise[:, 3, 3] = variance - correlation**2 * lasting
+        noise[:, 3, 3] = variance
         log_range = np.array([m.log_range for m in measurements])
         log_size = np.log([m.size_m for m in measurements])
-        sigma = np.sqrt(lasting)
-        return cls(*(a[:, None] for a in (bearing, log_range, log_size, sigma, correlation * sigma, noise)))
+        return cls(*(a[:, None] for a in (bearing, log_range, log_size, np.sqrt(lasting), noise)))
 
     def __getitem__(self, index: Sequence[int] | tuple[slice | int | None, ...]) -> Measurements:
         """Some of the measurements, or all in another shape."""
-        fields = (self.bearing, self.log_range, self.log_size, self.lasting, self.lasting_size, self.noise)
-        return Measurements(*(a[index] for a in fields))
+        return Measurements(*(column[index] for column in vars(self).values()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +92,6 @@ def initial(
     of_place = np.zeros((SIZE, 5))
     of_place[:3, :3], of_place[6, 3], of_place[7, 4] = measurement.range_m * np.eye(3), 1.0, 1.0
     of_place[:3, 4] = -measurement.range_m * measurement.bearing * measured.lasting[0]
-    of_place[6, 4] = -measured.lasting_size[0, 0]
     noise = np.eye(5)
     noise[:4, :4] = measured.noise[0, 0]
     covariance = np.repeat((of_place @ noise @ of_place.T)[None], len(velocities), axis=0)
@@ -165,10 +158,10 @@ def _linearised(mean: FloatArray, measured: Measurements) -> tuple[FloatArray, F
     derivative = np.zeros((*place.shape[:-1], 4, SIZE))
     derivative[..., :3, :3] = np.eye(3) / range_m[..., None, None]
     derivative[..., :3, 7] = measured.lasting[..., None] * bearing
-    derivative[..., 3, 6], derivative[..., 3, 7] = 1.0, measured.lasting_size
+    derivative[..., 3, 6] = 1.0
     residual = np.empty((*place.shape[:-1], 4))
     residual[..., :3] = place
-    residual[..., 3] = measured.log_size - mean[..., 6] - derivative[..., 3, 7] * mean[..., 7]
+    residual[..., 3] = measured.log_size - mean[..., 6]
     return residual, derivative
 
 

@@ -271,7 +271,7 @@ def test_the_first_update_is_the_textbook_kalman_filter() -> None:
     """By hand: 0.1 m at first sight, velocity +-0.7 m/s, 1 s on: as 2 * 0.49 / (0.4^2 * 0.5) = 12.25 s is how long a
     mate keeps a velocity of its own, w = 12.25 (1 - e^(-1 / 12.25)) = 0.960 m of way for each m/s."""
     tracker = Follower(
-        acceleration_sigma_m_s2=0.4, size_correlation=1e-6, range_error_lasts=1e-9, stranger_probability=1e-9,
+        acceleration_sigma_m_s2=0.4, range_error_lasts=1e-9, stranger_probability=1e-9,
     ).tracker  # fmt: skip
     tracker.update(0.0, [_seen(AHEAD, 0.1)], CRUISE)
     tracker.predict(1.0, np.array([1.0, 0.0, 0.0]))
@@ -405,16 +405,6 @@ def test_a_detection_of_another_size_is_of_another_drone() -> None:
     for size_m, number in ((0.3, 2), (0.6, 1)):
         flock = Follower().steps(1, AHEAD, sigma_m=0.4).steps(1, AHEAD, sigma_m=1.0)
         assert flock.step(_seen(0.5 * AHEAD, 0.1, size_m)) == (number,)
-
-
-@pytest.mark.parametrize(("size_m", "north_m"), [(0.72, 4.0), (0.6, 4.8)])
-def test_a_range_is_the_track_s_size_over_the_apparent_size(size_m: float, north_m: float) -> None:
-    """Twenty looks tell 0.6 m. A last one takes the drone for one of 0.72 m at 1.2 times its range: it looks as large
-    as before, so that it has not moved. Where it looks smaller by as much and of the same size, it has moved."""
-    flock = Follower(size_correlation=0.999, size_drift=1e-3, relative_speed_sigma_m_s=3.0, range_error_lasts=1e-9)
-    flock.steps(20, AHEAD, sigma_m=0.4)  # and is vague 5 s later
-    assert flock.step(_seen(1.2 * AHEAD, 0.4, size_m), after_s=10 * STEP_S) == (1,)
-    assert flock.one.position[0] == pytest.approx(north_m, abs=0.1)
 
 
 def test_a_detection_is_turned_into_level_axes() -> None:
