@@ -143,8 +143,8 @@ class _Reprojection:
     @property
     def parallaxes(self) -> FloatArray:
         """(2, m) derivatives by the logarithm of each point's depth in the camera that lifted it."""
-        R, t, n = self.motion.rotation, self.motion.translation[:, None], self.sights.current.shape[1]
-        centres = self.sights.centres[:, :n]
+        R, t = self.motion.rotation, self.motion.translation[:, None]
+        centres = self.sights.centres[:, : self.sights.current.shape[1]]
         between = np.concatenate([R @ centres + t, R.T @ (centres - t)], axis=1) - self.sights.centres
         along = (self.sights.seen * between).sum(0)
         changes = (self.residuals * along - products(self.sights.across, between)) / self.depths

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.config.drone import DroneConfig
@@ -387,23 +388,21 @@ class FlockPilot:
 
 def _why_refused(frames: FrameSet, vehicle: VehicleState) -> Reason | None:
     """What in a step's input is impossible; None: nothing."""
-    velocity = vehicle.velocity_ned
-    if not (math.isfinite(frames.time_s) and math.isfinite(vehicle.time_s)):
-        return Reason(ReasonKind.INPUT, "input refused: a time is not finite")
+    reading = vehicle.ground_range
+    numbers: dict[str, ArrayLike | None] = {
+        "a time": (frames.time_s, vehicle.time_s),
+        "the height": vehicle.height_m,
+        "the autopilot's velocity": vehicle.velocity_ned,
+        "the rate of turn": vehicle.turn_rate,
+        "the range finder's time": None if reading is None else reading.time_s,
+        "the autopilot's position": vehicle.position,
+        "the position of home": vehicle.home_deg,
+    }
+    for what, value in numbers.items():
+        if value is not None and not np.isfinite(value).all():
+            return Reason(ReasonKind.INPUT, f"input refused: {what} is not finite")
     if not _is_rotation(vehicle.R_ned_body):
         return Reason(ReasonKind.INPUT, "input refused: the attitude is not a rotation")
-    if not math.isfinite(vehicle.height_m):
-        return Reason(ReasonKind.INPUT, "input refused: the height is not finite")
-    if velocity is not None and not np.isfinite(velocity).all():
-        return Reason(ReasonKind.INPUT, "input refused: the autopilot's velocity is not finite")
-    if vehicle.turn_rate is not None and not np.isfinite(vehicle.turn_rate).all():
-        return Reason(ReasonKind.INPUT, "input refused: the rate of turn is not finite")
-    reading = vehicle.ground_range
-    if reading is not None and not math.isfinite(reading.time_s):
-        return Reason(ReasonKind.INPUT, "input refused: the range finder's time is not finite")
-    for place in (vehicle.position, vehicle.home_deg):
-        if place is not None and not np.isfinite(place).all():
-            return Reason(ReasonKind.INPUT, "input refused: the autopilot's position is not finite")
     return None
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from flockd.core.messages import Float32Array, FloatArray, UInt8Array
 
@@ -56,7 +56,7 @@ def group_instances(
         return labels, ()
     votes = np.array([columns + 0.5 + offset[0, rows, columns], rows + 0.5 + offset[1, rows, columns]]).T
     centres = _vote_peaks(votes, (height, width))
-    nearest = _nearest(votes, centres)
+    nearest = cKDTree(centres).query(votes)[1]
     sizes = np.bincount(nearest, minlength=len(centres))
     some = np.flatnonzero(sizes)
     count = sizes[some]
@@ -77,22 +77,6 @@ def group_instances(
     return labels, tuple(
         Instance(label, medians[k], boxes[k], float(areas[k]), scores[k]) for label, k in enumerate(kept, start=1)
     )
-
-
-def _nearest(votes: FloatArray, centres: FloatArray) -> NDArray[np.int64]:
-    """(n,) index of the centre nearest to each vote; of equally near ones the first.
-
-    One centre at a time: n numbers fit the processor's cache, n times k do not.
-    """
-    nearest = np.zeros(len(votes), np.int64)
-    right, down = np.ascontiguousarray(votes.T)
-    least = np.full(len(votes), np.inf)
-    for index, (u, v) in enumerate(centres):
-        distance = (right - u) ** 2 + (down - v) ** 2
-        nearer = distance < least
-        nearest[nearer] = index
-        np.minimum(distance, least, out=least)
-    return nearest
 
 
 def _vote_peaks(votes: FloatArray, shape: tuple[int, int]) -> FloatArray:

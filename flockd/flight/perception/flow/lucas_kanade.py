@@ -32,7 +32,6 @@ _OWN_WEIGHT = np.float32(0.25)
 """Weight above which a point keeps its own flow; below, it takes a share of its surroundings' flow."""
 _DRONE_MARGIN_PX = 20
 """Points and flow within this distance of a drone are not used: both contain the drone's own motion."""
-_NEAR_DRONES = np.ones((2 * _DRONE_MARGIN_PX + 1, 2 * _DRONE_MARGIN_PX + 1), np.uint8)
 _PYRAMID_LEVELS = 3
 """Halvings of the grid over which flow spreads."""
 _SURROUNDINGS_WEIGHT = 0.1
@@ -81,7 +80,8 @@ def grid_flow(flow: Float32Array, first: UInt8Array, second: UInt8Array, labels:
         box = np.s_[max(top - _DRONE_MARGIN_PX, 0) : top + rows + _DRONE_MARGIN_PX,
                     max(left - _DRONE_MARGIN_PX, 0) : left + columns + _DRONE_MARGIN_PX]  # fmt: skip
         around = np.ascontiguousarray(full[box])
-        cv2.copyTo(_between(settled, (width, height))[box], cv2.dilate(drones[box], _NEAR_DRONES), around)
+        near = cv2.dilate(drones[box], np.ones((3, 3), np.uint8), iterations=_DRONE_MARGIN_PX)
+        cv2.copyTo(_between(settled, (width, height))[box], near, around)
         cv2.copyTo(flow[box], drones[box], around)
         full[box] = around
     return full
@@ -124,8 +124,7 @@ def _tracked(
 def _beside(drones: UInt8Array, size: tuple[int, int]) -> BoolArray:
     """Which points are on a drone or beside one."""
     cells = cv2.resize(drones, size, interpolation=cv2.INTER_AREA)
-    reach = 2 * -(-_DRONE_MARGIN_PX // _GRID_PX) + 1
-    return np.asarray(cv2.dilate(cells, np.ones((reach, reach), np.uint8)) > 0)
+    return np.asarray(cv2.dilate(cells, np.ones((3, 3), np.uint8), iterations=-(-_DRONE_MARGIN_PX // _GRID_PX)) > 0)
 
 
 @lru_cache(maxsize=8)
