@@ -135,7 +135,7 @@ def _prepare_one(path: Path, config: DroneConfig) -> dict[str, Any]:
     """Runs a model on every shape of input that these cameras give it, keeps the engines, and opens it as in flight."""
     from flockd.flight.inference import OnnxModel
     from flockd.flight.inference.feeds import feeds_for, golden_feeds, shapes_of
-    from flockd.flight.inference.providers import builds_engines, engines_folder
+    from flockd.flight.inference.providers import BUILD_ENGINES, engines_folder
     from flockd.flight.perception.onnx import CROPS_PER_RUN
     from flockd.flight.perception.requirements import check_roles
 
@@ -147,7 +147,7 @@ def _prepare_one(path: Path, config: DroneConfig) -> dict[str, Any]:
         "check": check_roles,
     }
     begun_s = time.perf_counter()
-    if builds_engines(wanted.provider):
+    if wanted.provider in BUILD_ENGINES:
         model = OnnxModel(path, **options, preparing=True)
         sizes = sorted({camera.size_px for camera in config.rig.cameras})
         feeds = [

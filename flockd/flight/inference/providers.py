@@ -24,11 +24,11 @@ EXECUTION_PROVIDERS: dict[Provider, str] = {
     "tensorrt": "TensorrtExecutionProvider",
 }
 """OpenVINO computes by itself: ONNX Runtime's provider for it runs only some of the networks."""
-_BUILDS: frozenset[Provider] = frozenset({"tensorrt", "openvino"})
-"""These build an engine for a model and can keep it."""
-_SLOW_TO_BUILD: frozenset[Provider] = frozenset({"tensorrt"})
+BUILD_ENGINES: frozenset[Provider] = frozenset({"tensorrt", "openvino"})
+"""These build an engine for a model ahead of flight and can keep it."""
+SLOW_TO_BUILD: frozenset[Provider] = frozenset({"tensorrt"})
 """These take minutes for one, and for each new shape of input another: never in flight."""
-_STAMP = "prepared.json"
+_STAMP = "shapes.json"
 
 Shapes = Mapping[str, Sequence[int]]
 """By input."""
@@ -41,7 +41,7 @@ def engines_folder(config: PerceptionConfig) -> Path:
 
 def engine_folder(engines: Path | None, provider: Provider, name: str, sha256: str) -> Path | None:
     """Where the engines of one model are, for one provider and this version of its library; None: it keeps none."""
-    if engines is None or provider not in _BUILDS:
+    if engines is None or provider not in BUILD_ENGINES:
         return None
     version = importlib.metadata.version("openvino") if provider == "openvino" else ort.__version__
     return engines / f"{name}-{sha256[:16]}-{provider}-{version}"
@@ -136,56 +136,26 @@ def _providers(provider: Provider, folder: Path | None) -> list[tuple[str, dict[
 
 @dataclass(frozen=True)
 class Prepared:
-    """The range of input shapes that a model's engines were built for."""
+    """The shapes of inputs that a model's engines were built for; an engine is there for all between them too."""
 
-    smallest: Shapes
-    largest: Shapes
+    shapes: Sequence[Shapes]
 
     @staticmethod
     def load(folder: Path | None) -> Prepared | None:
         """What `save` wrote; None where nothing was prepared."""
-        try:
-            text = (folder / _STAMP).read_text(encoding="utf-8") if folder else ""
-        except OSError:
-            return None
-        return Prepared(**json.loads(text)) if text else None
+        stamp = None if folder is None else folder / _STAMP
+        return Prepared(json.loads(stamp.read_text(encoding="utf-8"))) if stamp and stamp.is_file() else None
 
     def save(self, folder: Path) -> None:
         """Beside the engines, once they are whole."""
-        stamp = {"smallest": _listed(self.smallest), "largest": _listed(self.largest)}
-        (folder / _STAMP).write_text(json.dumps(stamp), encoding="utf-8")
-
-    @staticmethod
-    def over(shapes: Sequence[Shapes]) -> Prepared:
-        """The range that some shapes span."""
-        names = shapes[0]
-        return Prepared(
-            {name: [min(sizes) for sizes in zip(*(s[name] for s in shapes), strict=True)] for name in names},
-            {name: [max(sizes) for sizes in zip(*(s[name] for s in shapes), strict=True)] for name in names},
-        )
+        (folder / _STAMP).write_text(json.dumps(self.shapes), encoding="utf-8")
 
     def covers(self, shapes: Shapes) -> bool:
         """Whether an engine is there for these."""
-        return all(
-            name in self.smallest
-            and len(shape) == len(self.smallest[name])
-            and all(
-                low <= size <= high
-                for low, size, high in zip(self.smallest[name], shape, self.largest[name], strict=True)
-            )
-            for name, shape in shapes.items()
-        )
-
-
-def _listed(shapes: Shapes) -> dict[str, list[int]]:
-    return {name: [int(size) for size in shape] for name, shape in shapes.items()}
-
-
-def builds_engines(provider: Provider) -> bool:
-    """Whether it can do work ahead of flight and keep it."""
-    return provider in _BUILDS
-
-
-def is_slow_to_build(provider: Provider) -> bool:
-    """Whether models must be prepared for it before they fly."""
-    return provider in _SLOW_TO_BUILD
+        for name, shape in shapes.items():
+            built = [one.get(name, ()) for one in self.shapes]
+            if any(len(one) != len(shape) for one in built):
+                return False
+            if not all(min(sizes) <= size <= max(sizes) for size, *sizes in zip(shape, *built, strict=True)):
+                return False
+        return True

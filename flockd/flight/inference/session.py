@@ -22,10 +22,10 @@ from flockd.flight.inference.feeds import golden_feeds, shapes_of
 from flockd.flight.inference.fitting import entering, leaving
 from flockd.flight.inference.manifest_file import Check, ManifestFile, nothing_more, read_manifest
 from flockd.flight.inference.providers import (
+    SLOW_TO_BUILD,
     Prepared,
     Shapes,
     engine_folder,
-    is_slow_to_build,
     open_runtime,
     provider_of,
 )
@@ -63,7 +63,7 @@ class OnnxModel:
         provider = provider_of(self.manifest, provider)
         self._engines = engine_folder(engines, provider, self.manifest.name, self.manifest.sha256)
         self._prepared = Prepared.load(self._engines)
-        self._may_build = preparing or not is_slow_to_build(provider)
+        self._may_build = preparing or provider not in SLOW_TO_BUILD
         if not self._may_build and self._prepared is None:
             message = f"is not prepared for {provider}, which would build its engine for minutes"
             raise file.error(("file",), f"{self.manifest.file} {message}; run `flockd models prepare` first")
@@ -112,7 +112,7 @@ class OnnxModel:
     def keep_engines(self, shapes: Sequence[Shapes]) -> None:
         """Note that the engines in the folder cover these shapes and all between them."""
         if self._engines is not None:
-            Prepared.over(shapes).save(self._engines)
+            Prepared(shapes).save(self._engines)
 
     def terminate(self) -> None:
         """Ends the runs that are under way, from any thread; they then raise an error of the library's own."""
