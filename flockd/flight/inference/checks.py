@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from flockd.core.choices import Provider
 from flockd.core.errors import FlockdError, UnavailableError, shortage_of
-from flockd.flight.inference.manifest import Fault, InputSpec, Manifest, OutputSpec, golden_deviates, listed
+from flockd.flight.inference.manifest import Fault, InputSpec, Manifest, OutputSpec, listed
 from flockd.flight.inference.manifest_file import ManifestFile
 
 _GOLDEN_TOLERANCE = 0.02
@@ -79,8 +79,11 @@ def check_golden(file: ManifestFile, provider: Provider, outputs: Mapping[str, N
     made_for = file.manifest.providers
     tolerance = _GOLDEN_TOLERANCE if not made_for or made_for[0] == provider else _ROUNDED_TOLERANCE
     for name, spec in file.manifest.outputs.items():
-        difference = golden_deviates(spec, outputs[name], tolerance)
-        if difference:
+        found, expected = (outputs[name].mean(), outputs[name].std()), (spec.golden_mean, spec.golden_deviation)
+        allowed = tolerance * (abs(spec.golden_mean) + spec.golden_deviation) + 1e-6
+        if not all(abs(one - other) <= allowed for one, other in zip(found, expected, strict=True)):
+            said, wanted = ("mean {:.4g} and deviation {:.4g}".format(*pair) for pair in (found, expected))
+            difference = f"the golden input gives {said}, not {wanted}"
             raise file.error(("outputs", name), f"{difference}; export the model and its manifest together")
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import cv2
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from flockd.core.messages import UInt8Array
 from flockd.flight.inference.fitting import Size, entering, fit
-from flockd.flight.inference.manifest import InputSpec, Manifest
+from flockd.flight.inference.manifest import Manifest
 
 Feeds = dict[str, NDArray[Any]]
 """By input."""
@@ -25,27 +25,17 @@ def golden_image(size: Size, seed: int = 0) -> UInt8Array:
 
 def golden_feeds(manifest: Manifest) -> Feeds:
     """The golden input: a fixed image for every image, zeros for planes."""
-    size, feeds = manifest.golden_size, {}
-    for index, (name, spec) in enumerate(manifest.inputs.items()):
-        if spec.kind == "planes":
-            feeds[name] = _zeros(manifest, spec, size)
-        else:
-            feeds[name] = entering(spec, [golden_image(size, index)])
-    return feeds
+    size = manifest.golden_size
+    return _feeds(manifest, size, lambda number: [golden_image(size, number)])
 
 
 def feeds_for(manifest: Manifest, image: Size, batch: int = 1) -> Feeds:
     """Empty inputs for images of a camera, or for a batch of crops."""
-    fitting, feeds = fit(manifest, image), {}
-    for name, spec in manifest.inputs.items():
-        if spec.kind == "planes":
-            feeds[name] = _zeros(manifest, spec, fitting.full)
-        elif manifest.crop is not None:
-            size = (manifest.crop_size_px, manifest.crop_size_px)
-            feeds[name] = entering(spec, [golden_image(size, seed) for seed in range(batch)])
-        else:
-            feeds[name] = entering(spec, [fitting.enter(golden_image(image))])
-    return feeds
+    fitting = fit(manifest, image)
+    if manifest.crop is None:
+        return _feeds(manifest, fitting.full, lambda _: [fitting.enter(golden_image(image))])
+    size = (manifest.crop_size_px, manifest.crop_size_px)
+    return _feeds(manifest, size, lambda _: [golden_image(size, seed) for seed in range(batch)])
 
 
 def shapes_of(feeds: Mapping[str, NDArray[Any]]) -> dict[str, list[int]]:
@@ -53,9 +43,15 @@ def shapes_of(feeds: Mapping[str, NDArray[Any]]) -> dict[str, list[int]]:
     return {name: list(value.shape) for name, value in feeds.items()}
 
 
-def _zeros(manifest: Manifest, spec: InputSpec, size: Size) -> NDArray[Any]:
-    """Planes of an input image of this size."""
-    planes, stride = spec.shape[1], manifest.map_stride
-    assert isinstance(planes, int)
-    assert stride is not None  # a manifest with planes has both
-    return np.zeros((1, planes, size[1] // stride, size[0] // stride), spec.dtype)
+def _feeds(manifest: Manifest, size: Size, images: Callable[[int], Sequence[UInt8Array]]) -> Feeds:
+    """The images of the input of each number, and planes of an input image of this size."""
+    feeds: Feeds = {}
+    for number, (name, spec) in enumerate(manifest.inputs.items()):
+        if spec.kind == "image":
+            feeds[name] = entering(spec, images(number))
+            continue
+        planes, stride = spec.shape[1], manifest.map_stride
+        assert isinstance(planes, int)
+        assert stride is not None  # a manifest with planes has both
+        feeds[name] = np.zeros((1, planes, size[1] // stride, size[0] // stride), spec.dtype)
+    return feeds

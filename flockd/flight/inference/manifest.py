@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from flockd.core.choices import Provider
@@ -118,9 +117,8 @@ class OutputSpec(TensorSpec):
         """Why the columns are impossible."""
         if not self.columns:
             return
-        doubled = sorted({name for name in self.columns if self.columns.count(name) > 1})
-        if doubled:
-            yield Fault(("columns",), f"names {doubled[0]!r} twice; give each column its own name")
+        if (doubled := _doubled(self.columns)) is not None:
+            yield Fault(("columns",), f"names {doubled!r} twice; give each column its own name")
         if len(self.shape) != 2 or self.shape[1] != len(self.columns):
             message = f"has {len(self.columns)} names for the shape {listed(self.shape)}; name each column of (n, k)"
             yield Fault(("columns",), message)
@@ -230,14 +228,12 @@ class Manifest(Section):
         images = [spec for spec in self.inputs.values() if spec.kind == "image"]
         if not images:
             yield Fault(("inputs",), "has no image; give one input `kind: image`")
-        for kind, names in (
-            ("carries", [spec.carries or name for name, spec in self.inputs.items()]),
-            ("gives", [spec.gives or name for name, spec in self.outputs.items()]),
+        for section, kind, names in (
+            ("inputs", "carries", [spec.carries or name for name, spec in self.inputs.items()]),
+            ("outputs", "gives", [spec.gives or name for name, spec in self.outputs.items()]),
         ):
-            doubled = sorted({name for name in names if names.count(name) > 1})
-            if doubled:
-                section = "inputs" if kind == "carries" else "outputs"
-                yield Fault((section,), f"has two of which each {kind} {doubled[0]!r}; correct `{kind}` of one")
+            if (doubled := _doubled(names)) is not None:
+                yield Fault((section,), f"has two of which each {kind} {doubled!r}; correct `{kind}` of one")
         if self.map_stride is None and len(images) < len(self.inputs):
             yield Fault(("map_stride",), "is missing; write how many image pixels one number of the planes stands for")
         if self.crop is not None and any(len(set(spec.image_size)) > 1 or not _is_fixed(spec) for spec in images):
@@ -250,6 +246,10 @@ def _located(section: Key, specs: Mapping[str, InputSpec] | Mapping[str, OutputS
             yield Fault((*section, name, *fault.key), fault.message)
 
 
+def _doubled(names: Sequence[str]) -> str | None:
+    return next((name for name in names if names.count(name) > 1), None)
+
+
 def _is_fixed(spec: InputSpec) -> bool:
     return all(isinstance(size, int) for size in spec.image_size)
 
@@ -257,15 +257,3 @@ def _is_fixed(spec: InputSpec) -> bool:
 def listed(shape: tuple[int | str | None, ...] | list[int | str | None]) -> str:
     """A tensor's shape as people write it."""
     return "[" + ", ".join("?" if size is None else str(size) for size in shape) + "]"
-
-
-def golden_deviates(spec: OutputSpec, values: NDArray[np.floating], tolerance: float) -> str | None:
-    """How an output for the golden input differs from the manifest's, or None where it does not."""
-    mean, deviation = float(values.mean()), float(values.std())
-    allowed = tolerance * (abs(spec.golden_mean) + spec.golden_deviation) + 1e-6
-    if abs(mean - spec.golden_mean) <= allowed and abs(deviation - spec.golden_deviation) <= allowed:
-        return None
-    return (
-        f"the golden input gives mean {mean:.4g} and deviation {deviation:.4g} where {spec.golden_mean:.4g} and "
-        f"{spec.golden_deviation:.4g} are expected"
-    )

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 
 from flockd.core.config.geometry import GeometryParameters
-from flockd.core.messages import Float32Array
 from flockd.flight.geometry import PointPairs, Rig, RigCamera, grid_pixels, lift_matches
-from flockd.flight.perception import CameraObservation, Observation
+from flockd.flight.perception import Observation
 
 _LEAST_MATCHES = 300
 """Matches of one image: at 640x480 pixels, 300 gave the own motion as precisely as 4,800."""
@@ -16,8 +14,10 @@ _LEAST_MATCHES = 300
 
 def background_pairs(rig: Rig, observation: Observation, parameters: GeometryParameters) -> PointPairs:
     """Background points that one camera sees in both frame sets. ValueError gives the reason if there are none."""
-    pairs, seen = [], list(_seen_twice(rig, observation))
-    for camera, before, after, flow in seen:
+    pairs = []
+    for name, flow in observation.flows.items():
+        assert observation.previous is not None
+        camera, before, after = rig.cameras[name], observation.previous.cameras[name], observation.cameras[name]
         if before.depth is None or after.depth is None:
             continue
         lifted = lift_matches(
@@ -26,7 +26,7 @@ def background_pairs(rig: Rig, observation: Observation, parameters: GeometryPar
         )  # fmt: skip
         pairs.append(lifted.select(lifted.labels == 0))
     if not pairs:
-        raise ValueError("no depth has a scale" if seen else "no camera has both frames")
+        raise ValueError("no depth has a scale" if observation.flows else "no camera has both frames")
     return PointPairs.concatenate(pairs)
 
 
@@ -34,12 +34,3 @@ def _stride_px(camera: RigCamera, parameters: GeometryParameters) -> int:
     """The configured stride, or a smaller one if a small image would give too few matches."""
     width, height = camera.camera.size
     return max(min(parameters.background_stride_px, math.isqrt(width * height // _LEAST_MATCHES)), 1)
-
-
-def _seen_twice(
-    rig: Rig, observation: Observation
-) -> Iterator[tuple[RigCamera, CameraObservation, CameraObservation, Float32Array]]:
-    """Each camera with an image in both frame sets: the camera, both observations, and the flow between them."""
-    if observation.previous is not None:
-        for name, flow in observation.flows.items():
-            yield rig.cameras[name], observation.previous.cameras[name], observation.cameras[name], flow
