@@ -90,25 +90,10 @@ class Camera(ABC):
         return math.sqrt(float(self.matrix[0, 0] * self.matrix[1, 1]))
 
     def _to_pixels(self, normalised: FloatArray) -> FloatArray:
-        """Changes its argument."""
-        # One column at a time: broadcasting a row of two is several times slower, and a crop has thousands of pixels.
-        for axis, (focal, centre) in enumerate(self._intrinsics):
-            normalised[:, axis] *= focal
-            normalised[:, axis] += centre
-        return normalised
+        return np.asarray(normalised * self.matrix[[0, 1], [0, 1]] + self.matrix[:2, 2])
 
     def _from_pixels(self, pixels: FloatArray) -> FloatArray:
-        normalised = np.empty((2, len(pixels)))
-        for axis, (focal, centre) in enumerate(self._intrinsics):
-            np.subtract(pixels[:, axis], centre, out=normalised[axis])
-            normalised[axis] /= focal
-        return normalised.T
-
-    @cached_property
-    def _intrinsics(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Focal length and principal point of each axis, pixels."""
-        (fx, _, cx), (_, fy, cy), _ = self.matrix.tolist()
-        return (fx, cx), (fy, cy)
+        return np.asarray((pixels - self.matrix[:2, 2]) / self.matrix[[0, 1], [0, 1]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,10 +108,7 @@ class PinholeCamera(Camera):
     def project(self, points: FloatArray) -> FloatArray:
         """Pixels (n, 2) of points (n, 3); NaN rows behind the camera."""
         points = np.asarray(points, dtype=np.float64)
-        inverse_z = 1.0 / np.where(points[:, 2] > 0.0, points[:, 2], np.nan)
-        normalised = np.empty((2, len(points))).T  # columns contiguous, for the operations below
-        np.multiply(points[:, 0], inverse_z, out=normalised[:, 0])
-        np.multiply(points[:, 1], inverse_z, out=normalised[:, 1])
+        normalised = points[:, :2] / np.where(points[:, 2:] > 0.0, points[:, 2:], np.nan)
         if self.distortion:
             normalised = self._distort(normalised)
         return self._to_pixels(normalised)
@@ -150,12 +132,9 @@ class PinholeCamera(Camera):
         normalised = self._from_pixels(pixels)
         if self.distortion:
             normalised = self._undistort(normalised)
-        unit, (x, y) = np.empty((len(normalised), 3)), normalised.T
+        x, y = normalised.T
         z = 1.0 / np.sqrt(x * x + y * y + 1.0)
-        np.multiply(x, z, out=unit[:, 0])
-        np.multiply(y, z, out=unit[:, 1])
-        unit[:, 2] = z
-        return unit
+        return np.stack([x * z, y * z, z], axis=1)
 
     def pixel_angle(self, rays: FloatArray) -> FloatArray:
         """(n,) radians: largest across the direction to the axis, where it falls with the cosine."""

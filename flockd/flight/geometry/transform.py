@@ -31,7 +31,9 @@ class RigidTransform:
             raise ValueError(f"a rigid transform is (3, 3) and (3,), not {rotation.shape} and {translation.shape}")
         if not np.isfinite(translation).all():
             raise ValueError("a rigid transform's translation must be finite")
-        if not (np.abs(rotation @ rotation.T - _EYE) <= _TOLERANCE).all() or _is_mirrored(rotation):  # NaN fails too
+        if (
+            not (np.abs(rotation @ rotation.T - _EYE) <= _TOLERANCE).all() or np.linalg.det(rotation) < 0.0
+        ):  # NaN fails too
             raise ValueError("the matrix is not a rotation: its columns must be orthonormal and right-handed")
         object.__setattr__(self, "rotation", rotation)
         object.__setattr__(self, "translation", translation)
@@ -57,9 +59,3 @@ class RigidTransform:
     def __matmul__(self, other: RigidTransform) -> RigidTransform:
         """``T_a_b @ T_b_c`` is ``T_a_c``."""
         return RigidTransform(self.rotation @ other.rotation, self.apply(other.translation))
-
-
-def _is_mirrored(matrix: FloatArray) -> bool:
-    """Whether the determinant of a (3, 3) matrix is negative; called a hundred times in a pilot's step."""
-    (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()
-    return bool(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) < 0.0)

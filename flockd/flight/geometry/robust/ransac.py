@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flockd.core.messages import BoolArray, FloatArray, IntArray
+from flockd.core.messages import BoolArray, FloatArray
 from flockd.flight.geometry.rigid_fit import checked_pairs, fit_rigid, kabsch
 from flockd.flight.geometry.transform import RigidTransform
 
@@ -76,7 +76,7 @@ def _hypotheses(
     source: FloatArray, target: FloatArray, count: int, random: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
     """Motions (b, 3, 3), (b, 3) that fit random triples best (Eq. 18-20), without collinear triples."""
-    triples = _random_triples(len(source), count, random)
+    triples = random.integers(0, len(source), (count, 3))  # one that has a point twice has no area
     corners = np.stack([source[triples], target[triples]])
     a, b = corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0]
     longest2 = np.maximum.reduce([(side**2).sum(axis=-1) for side in (a, b, a - b)])
@@ -85,18 +85,6 @@ def _hypotheses(
     if not wide.any():
         raise ValueError("the points are collinear: no three of those drawn span a triangle")
     return kabsch(corners[0, wide], corners[1, wide], np.full(3, 1.0 / 3.0))
-
-
-def _random_triples(n: int, count: int, random: np.random.Generator) -> IntArray:
-    """(count, 3) indices below n, three different ones in each row."""
-    first = random.integers(0, n, count)
-    second = random.integers(0, n - 1, count)
-    second += second >= first
-    third = random.integers(0, n - 2, count)
-    # Skip the two that are taken, the lower one first.
-    third += third >= np.minimum(first, second)
-    third += third >= np.maximum(first, second)
-    return np.stack([first, second, third], axis=1)
 
 
 def _best(
