@@ -105,6 +105,7 @@ KEYS: Mapping[str, str] = {
     "perception.detection.prediction_gate": "delete it: what is found where a track was predicted counts as all else",
     "perception.detection.residual_distance_px": "delete it: only what is segmented or predicted is proposed",
     "perception.detection.residual_px": "delete it: only what is segmented or predicted is proposed",
+    "perception.flow_refinement_scale": "delete it: `dis` stops at half the size",
     "recording.file_mb": "delete it: a flight is one file",
     "stop": "delete it: all `seeds` are flown",
     "safety.degraded_gusts_m_s": "write `degraded_velocity_error_m_s`",

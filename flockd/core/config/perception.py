@@ -107,8 +107,6 @@ class PerceptionConfig(Section):
     It follows points 16 px apart, and where the images show nothing, the surroundings determine the flow. `dis` takes
     34 ms, and each pixel keeps its own flow: for a sensor's depth, and images that are blurred and moved far.
     """
-    flow_refinement_scale: Annotated[int, Field(ge=0, le=5)] = 1
-    """Where `dis` after a network stops: at a 2^n-th of the size."""
     depth: str = "neighbours_int8"
     segmentation: str = "neighbours_int8"
     detector: str = "detector"

@@ -6,7 +6,7 @@ from flockd.flight.geometry.ego_motion import estimate_ego_motion, moved_pixels
 from flockd.flight.geometry.ego_motion_refinement import refine_ego_motion
 from flockd.flight.geometry.ground import ground_inverse_depth
 from flockd.flight.geometry.ground_fit import GroundSamples, fit_ground
-from flockd.flight.geometry.pairs import BACKGROUND_LABEL, PointPairs, grid_pixels, lift_matches
+from flockd.flight.geometry.pairs import PointPairs, grid_pixels, lift_matches
 from flockd.flight.geometry.polar import log_polar, log_polar_covariance, log_polar_residual
 from flockd.flight.geometry.rig import Rig, RigCamera, build_rig
 from flockd.flight.geometry.rigid_fit import fit_rigid
@@ -25,7 +25,6 @@ from flockd.flight.geometry.transform import RigidTransform
 from flockd.flight.geometry.virtual_camera import VirtualCrops, virtual_crops
 
 __all__ = [
-    "BACKGROUND_LABEL",
     "Camera",
     "GroundSamples",
     "PinholeCamera",

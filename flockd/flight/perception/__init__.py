@@ -1,7 +1,7 @@
 """Perception: frames in, an observation out; each role is an ONNX model with a manifest."""
 
 from flockd.flight.perception.detection.instances import Instance, group_instances
-from flockd.flight.perception.flow import DisFlow, Flow, OnnxFlow
+from flockd.flight.perception.flow import DisFlow, OnnxFlow
 from flockd.flight.perception.interface import ImageNetworks, ImagePair, ImageView, Networks, OneByOne, outcome
 from flockd.flight.perception.maps import Crop, OpenDepth, RangeEstimate, SceneMaps
 from flockd.flight.perception.observation import CameraObservation, Observation
@@ -12,7 +12,6 @@ __all__ = [
     "CameraObservation",
     "Crop",
     "DisFlow",
-    "Flow",
     "ImageNetworks",
     "ImagePair",
     "ImageView",

@@ -245,7 +245,7 @@ class OnnxNetworks(OneByOne):
         if config.flow == "dis":
             return DisFlow()
         network = OnnxFlow(self._models.open(config.flow, "flow"))
-        return DisFlow(network, config.flow_refinement_scale) if config.flow_refinement == "dis" else network
+        return DisFlow(network) if config.flow_refinement == "dis" else network
 
 
 _OF_CROPS = frozenset({"distance", "verification"})

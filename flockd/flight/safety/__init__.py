@@ -6,9 +6,9 @@ from flockd.core.config.safety import GateParameters, SafetyParameters
 from flockd.flight.safety.events import OFFBOARD, CameraHealth, Event, Inputs, MissionEnd, link_lost
 from flockd.flight.safety.fence import outside_fence, outside_heights
 from flockd.flight.safety.gate import Gate
-from flockd.flight.safety.policy import Action, Reaction
+from flockd.flight.safety.policy import Action
 from flockd.flight.safety.request import Objection, Permission, Request, Surroundings, Verdict
-from flockd.flight.safety.supervisor import Decision, Reason, State, Supervisor
+from flockd.flight.safety.supervisor import Decision, State, Supervisor
 
 __all__ = [
     "OFFBOARD",
@@ -22,8 +22,6 @@ __all__ = [
     "MissionEnd",
     "Objection",
     "Permission",
-    "Reaction",
-    "Reason",
     "Request",
     "SafetyParameters",
     "State",

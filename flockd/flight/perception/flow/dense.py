@@ -18,12 +18,10 @@ class DisFlow:
     It is exact to a fraction of a pixel if it converges, but loses large motions; a network is the opposite.
     """
 
-    def __init__(self, start: Flow | None = None, finest_scale: int = 1) -> None:
-        """``start``: the flow that initialises the coarsest scale; None: no motion. ``finest_scale``: it stops at a
-        2^n-th of the size."""
+    def __init__(self, start: Flow | None = None) -> None:
+        """``start``: the flow that initialises the coarsest scale; None: no motion."""
         self.name = f"{start.name}+dis" if start else "dis"
         self._start = start
-        self._finest_scale = finest_scale
         self._idle: list[cv2.DISOpticalFlow] = []
         """Instances not in use: none serves two callers at once. Reusing one's memory saves a third of the time."""
 
@@ -31,16 +29,11 @@ class DisFlow:
         """See `Flow`."""
         before, after = grey(first), grey(second)
         start = np.zeros((*before.shape, 2), np.float32) if self._start is None else self._start.flow(first, second)
-        dis = self._idle.pop() if self._idle else self._made()
+        dis = self._idle.pop() if self._idle else cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
         try:
             return np.asarray(dis.calc(before, after, start), dtype=np.float32)
         finally:
             self._idle.append(dis)
-
-    def _made(self) -> cv2.DISOpticalFlow:
-        dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-        dis.setFinestScale(self._finest_scale)
-        return dis
 
 
 class OnnxFlow:
