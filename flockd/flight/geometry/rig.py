@@ -59,10 +59,6 @@ class Rig:
                 break
         return seen
 
-    def pixels_of(self, points_body: FloatArray) -> dict[str, FloatArray]:
-        """For each camera the (n, 2) pixels of body points (n, 3); NaN rows where the point is not in its image."""
-        return {name: camera.pixels_of_points(points_body) for name, camera in self.cameras.items()}
-
     def shows(self, points_body: FloatArray, radius_m: float = 0.0, without: Set[str] = frozenset()) -> BoolArray:
         """Mask (n,): body points (n, 3) around which any camera not in ``without`` images all within `radius_m`."""
         shown = np.zeros(len(points_body), dtype=np.bool_)

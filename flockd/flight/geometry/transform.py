@@ -38,11 +38,6 @@ class RigidTransform:
         object.__setattr__(self, "rotation", rotation)
         object.__setattr__(self, "translation", translation)
 
-    @classmethod
-    def identity(cls) -> RigidTransform:
-        """No motion."""
-        return cls(np.eye(3), np.zeros(3))
-
     def apply(self, points: FloatArray) -> FloatArray:
         """Points (..., 3) of frame b in frame a."""
         moved: FloatArray = np.asarray(points) @ self.rotation.T + self.translation

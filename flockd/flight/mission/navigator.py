@@ -15,7 +15,7 @@ from flockd.flight.geometry import Rig
 from flockd.flight.mission.circle_then_tangent import CircleThenTangent
 from flockd.flight.mission.guidance import Guidance, Mission, Moment, course_of
 from flockd.flight.mission.operator import Operator
-from flockd.flight.mission.velocity import Follow, Hover, Velocity
+from flockd.flight.mission.velocity import Still, Velocity
 from flockd.flight.mission.waypoints import Waypoints
 from flockd.flight.obstacles import AZIMUTHS, in_view
 
@@ -140,12 +140,12 @@ def _mission(parameters: MissionParameters, gate: GateParameters) -> Mission:
         case "circle_then_tangent":
             return CircleThenTangent(parameters)
         case "hover":
-            return Hover()
+            return Still("hovers")
         case "velocity":
             return Velocity(parameters)
         case "waypoints":
             return Waypoints(parameters, gate)
         case "follow":
-            return Follow()
+            return Still("follows the flock")
         case "operator":
             return Operator(parameters)

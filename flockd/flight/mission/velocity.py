@@ -20,17 +20,13 @@ class Velocity:
         return Guidance(self._velocity, "flies at its velocity", course_of(self._velocity))
 
 
-class Hover:
-    """Desires velocity zero; the law still keeps the flock together."""
+class Still:
+    """Desires velocity zero: the law still keeps the flock together, and moves a drone that follows it (W_i = 0)."""
+
+    def __init__(self, sentence: str) -> None:
+        """`sentence`: what it does, for people."""
+        self._guidance = Guidance(np.zeros(2), sentence)
 
     def step(self, moment: Moment) -> Guidance:
         """See `Mission`."""
-        return Guidance(np.zeros(2), "hovers")
-
-
-class Follow:
-    """Follows the flock: Eq. 42 with W_i = 0, so that only cohesion and alignment move the drone."""
-
-    def step(self, moment: Moment) -> Guidance:
-        """See `Mission`."""
-        return Guidance(np.zeros(2), "follows the flock")
+        return self._guidance

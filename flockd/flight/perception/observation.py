@@ -18,9 +18,7 @@ class CameraObservation:
     image: UInt8Array
     """(h, w, 3) RGB."""
     depth: RangeMap | None
-    """(h, w) metres along the ray, drones at their detections' ranges; NaN where the lens images nothing.
-
-    None: it has no scale."""
+    """(h, w) metres along the ray; NaN where the lens images nothing. None: it has no scale."""
     labels: UInt8Array
     """(h, w) 0 background, k the detection with label k, 255 not to be used."""
     flow: Float32Array | None

@@ -9,7 +9,7 @@ from flockd.core.config.perception import PerceptionConfig
 from flockd.core.messages import Float32Array, Frame, FrameSet, GroundEstimate, Reason, ReasonKind, VehicleState
 from flockd.flight.geometry import RangeMap, Rig, ground_inverse_depth
 from flockd.flight.perception.detection.detector import DetectionTrace, Detector
-from flockd.flight.perception.detection.masks import depth_of_drones, without_borders
+from flockd.flight.perception.detection.masks import without_borders
 from flockd.flight.perception.image_monitor import ImageMonitor
 from flockd.flight.perception.interface import CAMERA_FAULTS, ImagePair, ImageView, Networks
 from flockd.flight.perception.maps import KnownSize, SceneMaps
@@ -64,11 +64,8 @@ class Perception:
         found = self._detector.detect(images, scenes, depths, vehicle, predictions, trace or DetectionTrace(), size)
         cameras = {}
         for name, mask in found.masks.items():
-            metres = depths.get(name)
-            if metres is not None:
-                metres = depth_of_drones(metres, mask, self._rig.cameras[name], found.detections)
             labels = without_borders(mask, self._config.detection.mask_border_px)
-            cameras[name] = CameraObservation(images[name], metres, labels, flows.get(name))
+            cameras[name] = CameraObservation(images[name], depths.get(name), labels, flows.get(name))
         reasons = (*without_image, *without_scene, *without_pair, *without_flow, *found.reasons)
         self._last = Observation(frames.time_s, vehicle, cameras, found.detections, previous, reasons, noisy)
         lap("detection")

@@ -168,7 +168,8 @@ def test_four_upright_cameras_see_all_around_but_not_straight_down() -> None:
 
 
 def test_a_point_lands_in_the_cameras_that_see_it_with_their_lever_arms() -> None:
-    pixels = four_camera_rig().pixels_of(np.array([[2.1, 1.0, 0.5], [-2.1, 0.0, 0.0]]))
+    places = np.array([[2.1, 1.0, 0.5], [-2.1, 0.0, 0.0]])
+    pixels = {name: camera.pixels_of_points(places) for name, camera in four_camera_rig().cameras.items()}
     # The front camera sits 0.1 m ahead: 2 m in front of it, 1 m right and 0.5 m down.
     assert pixels["front"][0] == pytest.approx([240.0 + 111.0, 320.0 + 55.5])
     assert pixels["back"][1] == pytest.approx([240.0, 320.0])

@@ -88,7 +88,9 @@ def propose_predictions(
         except ValueError as error:
             reasons.append(Reason(ReasonKind.PROPOSAL, f"proposal of a track: {error}"))
             continue
-        cameras = tuple(name for name, pixel in rig.pixels_of(place[None]).items() if np.isfinite(pixel).all())
+        cameras = tuple(
+            one.name for one in rig.cameras.values() if np.isfinite(one.pixels_of_points(place[None])).all()
+        )
         if not cameras:
             continue
         finest = pixel_angles(rig, [cameras], bearing[None])
