@@ -23,13 +23,18 @@ LINES = {
     "flockd/core": 3_240,
     "flockd/flight": 11_130,
     "flockd/onboard": 9_330,
-    "flockd/fleet": 2_700,
+    "flockd/fleet": 2_730,
     "flockd/ground": 5_040,
     "flockd/review": 3_600,
     "flockd/sim": 8_890,
     "flockd/campaign": 1_490,
+<<<<<<< HEAD
     "flockd/cli": 3_740,
     "tests": 39_100,
+=======
+    "flockd/cli": 3_720,
+    "tests": 39_160,
+>>>>>>> 5e0b4a4c (`flockd ros perceive` takes PX4's own VehicleOdometry and VehicleAttitude as the vehicle's state)
     "tools/checks": 2_060,
     "tools/docs": 1_000,
     "tools/measure": 1_520,

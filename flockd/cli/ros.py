@@ -53,7 +53,7 @@ def _add_perceive(commands: Commands) -> None:
         notes=notes,
     )  # fmt: skip
     option(parser, "--config FILE", "the drone's configuration, with `source`", Path, required=True)
-    option(parser, "--vehicle TOPIC", "odometry, pose or IMU of the vehicle, in REP 103's axes")
+    option(parser, "--vehicle TOPIC", "odometry, pose or IMU of the vehicle in REP 103's axes, or PX4's own odometry")
     _add_network(parser)
 
 

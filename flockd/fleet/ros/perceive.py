@@ -14,7 +14,7 @@ from flockd.core.errors import UsageError
 from flockd.core.messages import PilotOutput, VehicleState
 from flockd.fleet.ros import message_trees as trees
 from flockd.fleet.ros.message_trees import Names, ros_name
-from flockd.fleet.ros.ros_input import STATES, NearestState, stamp_ns, vehicle_state
+from flockd.fleet.ros.ros_input import STATES, NearestState, check_height, state_stamp_ns, vehicle_state
 from flockd.fleet.ros.ros_node import Delivery, RosNode
 from flockd.flight.pilot import FlockPilot
 from flockd.onboard.daemon import load_side_by_side
@@ -61,7 +61,7 @@ class PerceptionNode:
                 if frames is None or frames.time_s < self._last_s + self._config.step_s - slack_s:
                     self._tell(source, [] if frames else None)
                 elif vehicle is None:
-                    self._tell(source, ["no state of the vehicle is near the images' time; check --vehicle"])
+                    self._tell(source, [self._missing()])
                 else:
                     self._last_s = frames.time_s
                     output = self._pilot.step(frames, vehicle)
@@ -78,10 +78,18 @@ class PerceptionNode:
             kind = next((kind for kind in self._node.kinds(self._vehicle_topic) if kind in STATES), None)
             if kind is None:
                 return None
+            check_height(self._vehicle_topic, kind, self._config)
             self._states = NearestState()
             take = partial(_take_state, self._states, kind)
             self._node.subscribe(self._vehicle_topic, kind, take, Delivery.SENSOR)
         return self._states.at(time_s + self._config.rig.time_offset_s)
+
+    def _missing(self) -> str:
+        """Why there is no state of the vehicle."""
+        if self._states is not None:
+            return f"no state of {self._vehicle_topic} is near the images' time; are their stamps of one clock?"
+        there = ", ".join(self._node.kinds(self._vehicle_topic or "")) or "not published"
+        return f"{self._vehicle_topic} is {there}; name one of {', '.join(STATES)} with --vehicle"
 
     def _publish(self, output: PilotOutput) -> None:
         """Stamped as the images were."""
@@ -106,5 +114,6 @@ class PerceptionNode:
 
 
 def _take_state(states: NearestState, kind: str, message: Any) -> None:
-    time_s = 1e-9 * (stamp_ns(message) + time.monotonic_ns() - time.time_ns())
-    states.add(vehicle_state(kind, message, time_s))
+    now_ns = time.time_ns()
+    true_ns, _ = state_stamp_ns(kind, message, now_ns)
+    states.add(vehicle_state(kind, message, 1e-9 * (true_ns + time.monotonic_ns() - now_ns)))

@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from flockd.core.config import DroneConfig
+from flockd.core.errors import UsageError
 from flockd.core.messages import FloatArray, VehicleState
 from flockd.fleet.ros.message_trees import IMU, ODOMETRY, POSE
 from flockd.fleet.ros.ros_frames import attitude_of_ros, frd_of_flu, ned_of_enu, rotation_of
@@ -37,7 +39,9 @@ def image_of(message: Any) -> RosImage:
     return RosImage(stamp_ns(message), message.encoding, bytes(message.data), size, message.step)
 
 
-STATES = (ODOMETRY, POSE, IMU)
+PX4_ODOMETRY, PX4_ATTITUDE = "px4_msgs/msg/VehicleOdometry", "px4_msgs/msg/VehicleAttitude"
+"""PX4's own, without a header."""
+STATES = (ODOMETRY, PX4_ODOMETRY, POSE, IMU, PX4_ATTITUDE)
 """What a vehicle's state may come from, the best first."""
 LONGEST_GAP_S = 0.2
 """Between the state and the images that it is of."""
@@ -48,11 +52,30 @@ def stamp_ns(message: Any) -> int:
     return int(message.header.stamp.sec) * _NS + int(message.header.stamp.nanosec)
 
 
-def vehicle_state(kind: str, message: Any, time_s: float) -> VehicleState | None:
-    """None for a message whose orientation nobody filled in. An Imu knows no height, so that it is 0.
+def state_stamp_ns(kind: str, message: Any, arrived_ns: int) -> tuple[int, bool]:
+    """When a state was true, and whether that is when it arrived, as PX4 stamps by a clock of its own: from its start,
+    not from 1970."""
+    if kind not in {PX4_ODOMETRY, PX4_ATTITUDE}:
+        return stamp_ns(message), False
+    own_clock = abs((stamp := 1000 * int(message.timestamp)) - arrived_ns) > _NS
+    return arrived_ns if own_clock else stamp, own_clock
 
-    ``message``: of rclpy or `rosbags`, whose fields have the same names.
+
+def check_height(topic: str, kind: str, config: DroneConfig) -> None:
+    """Raises UsageError where the configuration needs a height and states of that kind have none."""
+    if kind in {IMU, PX4_ATTITUDE} and config.perception.scale == "height":
+        raise UsageError(
+            f"{topic} has an attitude and no height; set perception.scale to `network`, or name odometry with --vehicle"
+        )
+
+
+def vehicle_state(kind: str, message: Any, time_s: float) -> VehicleState | None:
+    """None for a message whose orientation nobody filled in. An attitude alone knows no height, so that it is 0.
+
+    ``message``: of rclpy or `rosbags`, whose fields have the same names; ``kind``: one of `STATES`.
     """
+    if kind in {PX4_ODOMETRY, PX4_ATTITUDE}:
+        return _px4_state(kind, message, time_s)
     pose = message.pose.pose if kind == ODOMETRY else message.pose if kind == POSE else message
     try:
         R_ned_body = attitude_of_ros(rotation_of(_values(pose.orientation, "xyzw")))
@@ -68,14 +91,11 @@ def vehicle_state(kind: str, message: Any, time_s: float) -> VehicleState | None
     return VehicleState(time_s, R_ned_body, -float(place[2]), velocity, place[:2])
 
 
-PX4_STATES = PX4_ODOMETRY, PX4_ATTITUDE = "px4_msgs/msg/VehicleOdometry", "px4_msgs/msg/VehicleAttitude"
-"""PX4's own, without a header."""
 _NED, _BODY_FRD = 1, 3
 
 
-def px4_state(kind: str, message: Any, time_s: float) -> VehicleState | None:
-    """Of PX4's own messages, whose axes are flockd's; None where its estimator had none. An attitude alone knows no
-    height, so that it is 0."""
+def _px4_state(kind: str, message: Any, time_s: float) -> VehicleState | None:
+    """Of messages whose axes are flockd's; None where PX4's estimator had none."""
     try:
         R_ned_body = rotation_of(np.array([*message.q[1:], message.q[0]], np.float64))
     except ValueError:

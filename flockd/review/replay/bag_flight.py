@@ -21,18 +21,16 @@ from flockd.core.config import DroneConfig
 from flockd.core.config.source import CameraDeviceParameters
 from flockd.core.errors import UsageError
 from flockd.core.messages import UInt8Array, VehicleState
-from flockd.fleet.ros.message_trees import COMPRESSED_IMAGE, IMU
+from flockd.fleet.ros.message_trees import COMPRESSED_IMAGE
 from flockd.fleet.ros.ros_input import (
     LONGEST_GAP_S,
-    PX4_ATTITUDE,
-    PX4_ODOMETRY,
-    PX4_STATES,
     STATES,
     NearestState,
     RosImage,
+    check_height,
     image_of,
-    px4_state,
     stamp_ns,
+    state_stamp_ns,
     vehicle_state,
 )
 from flockd.flight.inference.manifest_file import model_hashes
@@ -210,41 +208,30 @@ class _PngFormat:
 
 def _states(bag: Bag, topic: str, config: DroneConfig, began_ns: int, tell: Callable[[str], None]) -> NearestState:
     """All of the bag."""
-    if bag.kinds()[topic] in {IMU, PX4_ATTITUDE} and config.perception.scale == "height":
-        raise UsageError(
-            f"{bag.path}: {topic} has an attitude and no height; set perception.scale to `network`, or name "
-            "odometry with --vehicle"
-        )
-    states, own_clock = NearestState(kept=None), False
+    check_height(f"{bag.path}: {topic}", bag.kinds()[topic], config)
+    states, on_arrival = NearestState(kept=None), False
     for message in bag.messages([topic]):
         content = bag.read(message)
-        if message.kind not in PX4_STATES:
-            stamp = stamp_ns(content)
-        elif abs((stamp := 1000 * int(content.timestamp)) - message.time_ns) > _OF_ONE_CLOCK_NS:
-            own_clock, stamp = True, message.time_ns
-        state = vehicle_state if message.kind not in PX4_STATES else px4_state
-        states.add(state(message.kind, content, _time_s(stamp, began_ns)))
-    if own_clock:
+        stamp, own_clock = state_stamp_ns(message.kind, content, message.time_ns)
+        on_arrival |= own_clock
+        states.add(vehicle_state(message.kind, content, _time_s(stamp, began_ns)))
+    if on_arrival:
         tell(
             f"{bag.path}: stamps of {topic} are of the autopilot's own clock; the times at which it was recorded count"
         )
     return states
 
 
-_OF_ONE_CLOCK_NS = 1_000_000_000
-"""Stamps of PX4 that differ from the recording's times by more count from its start, not from 1970."""
-
-
 def _vehicle_topic(bag: Bag, wanted: str | None) -> str:
     """The topic that is named, or the only one of the best kind there is. Raises UsageError."""
-    kinds, known = bag.kinds(), (*STATES[:1], PX4_ODOMETRY, *STATES[1:], PX4_ATTITUDE)
+    kinds = bag.kinds()
     if wanted is not None:
-        if kinds.get(wanted) not in known:
+        if kinds.get(wanted) not in STATES:
             raise UsageError(
-                f"{bag.path}: {wanted} is {kinds.get(wanted, 'not in it')}; name one of {', '.join(known)}"
+                f"{bag.path}: {wanted} is {kinds.get(wanted, 'not in it')}; name one of {', '.join(STATES)}"
             )
         return wanted
-    for kind in known:
+    for kind in STATES:
         topics = sorted(topic for topic, its in kinds.items() if its == kind)
         if len(topics) == 1:
             return topics[0]

@@ -1,14 +1,17 @@
 """A driver of somebody else's: publishes camera images as Image with CameraInfo, with nothing of flockd's.
 
 ros_cameras.py FILE. The file is an npz: `stamps` (seconds, when each set was taken), and for each camera of `names`
-`images_NAME` (n, h, w, 3) RGB and `k_NAME` (9,). It waits until each camera has a reader, then publishes each set as
+`images_NAME` (n, h, w, 3) RGB and `k_NAME` (9,). With `px4`, a quaternion (4,), it is PX4 too: level flight 3 m above
+home, 20 times a second, stamped since its start. It waits until each camera has a reader, then publishes each set as
 long after the first as it was taken after that, stamped by this computer's clock.
 """
 
 from __future__ import annotations
 
 import importlib
+import itertools
 import sys
+import threading
 import time
 from array import array
 from typing import Any
@@ -28,6 +31,8 @@ def main() -> None:
     node = rclpy.create_node("driver")
     images = {name: node.create_publisher(MESSAGES.Image, f"/{name}/image_raw", 5) for name in names}
     lenses = {name: node.create_publisher(MESSAGES.CameraInfo, f"/{name}/camera_info", 5) for name in names}
+    if "px4" in flight:
+        threading.Thread(target=publish_px4, args=(node, flight["px4"]), daemon=True).start()
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     while not all(images[name].get_subscription_count() and lenses[name].get_subscription_count() for name in names):
@@ -40,6 +45,15 @@ def main() -> None:
         for name in names:
             publish(images[name], lenses[name], flight[f"images_{name}"][number], flight[f"k_{name}"], stamp_ns)
     sys.stdin.read()
+
+
+def publish_px4(node: Any, turn: Any) -> None:
+    kind = importlib.import_module("px4_msgs.msg").VehicleOdometry
+    publisher = node.create_publisher(kind, "/fmu/out/vehicle_odometry", rclpy.qos.qos_profile_sensor_data)
+    for tick in itertools.count():
+        position = np.array([0.0, 0.0, -3.0], np.float32)
+        publisher.publish(kind(timestamp=50_000 * tick, pose_frame=1, position=position, q=turn, velocity_frame=1))
+        time.sleep(0.05)
 
 
 def publish(images: Any, lenses: Any, pixels: Any, k: Any, stamp_ns: int) -> None:

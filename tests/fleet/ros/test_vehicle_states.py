@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from flockd.fleet.ros.message_trees import IMU, ODOMETRY, POSE
-from flockd.fleet.ros.ros_input import LONGEST_GAP_S, NearestState, vehicle_state
+from flockd.fleet.ros.ros_input import LONGEST_GAP_S, PX4_ATTITUDE, NearestState, state_stamp_ns, vehicle_state
 from tests.make import vehicle
 
 
@@ -51,6 +51,16 @@ def test_what_nobody_filled_in_is_not_taken() -> None:
     assert unknown is not None
     assert unknown.velocity_ned is None
     assert vehicle_state(POSE, _message(POSE, w=0.0), 7.0) is None
+
+
+@pytest.mark.parametrize(("stamp_us", "true_ns"), [(1_000_000_200_000, 1_000_000_200_000_000), (7_000_000, 10**15)])
+def test_px4_stamps_by_the_computers_clock_or_since_its_own_start(stamp_us: int, true_ns: int) -> None:
+    """By the second one a state was true when it arrived: here 0.2 s before its stamp, and long after it."""
+    message = SimpleNamespace(timestamp=stamp_us, q=[math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)])
+    assert state_stamp_ns(PX4_ATTITUDE, message, 10**15) == (true_ns, true_ns == 10**15)
+    state = vehicle_state(PX4_ATTITUDE, message, 7.0)
+    assert state is not None
+    np.testing.assert_allclose(state.R_ned_body[:, 0], [0.0, 1.0, 0.0], atol=1e-12)  # it faces east
 
 
 def test_the_nearest_state_is_the_nearest_on_either_side_and_none_is_far() -> None:
