@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import atexit
+import importlib.util
 import os
 import sys
 from collections.abc import Sequence
@@ -35,7 +36,7 @@ from flockd.core.jpeg_header import MAX_IMAGE_PIXELS
 
 # Packages of an extra: without them a command is unavailable, not broken.
 EXTRAS = {
-    **dict.fromkeys(("numba", "llvmlite", "matplotlib", "jinja2", "markupsafe"), "sim"),
+    **dict.fromkeys(("numba", "llvmlite", "matplotlib", "jinja2", "markupsafe", "pymavlink"), "sim"),
     "joblib": "campaign",
     "argcomplete": "completion",
     **dict.fromkeys(("aiohttp", "plotly"), "fleet"),
@@ -54,11 +55,16 @@ exit codes:
 
 
 def installing(extra: str) -> str:
-    """The command that adds an extra to this flockd and leaves the rest as it is: a checkout stays one."""
+    """What to do for an extra: a command that leaves the rest as it is, so that a checkout stays one.
+
+    A Debian package has no pip, and its files are apt's.
+    """
+    if importlib.util.find_spec("pip") is None:
+        return f"install flockd with the extra {extra} in an environment of its own, as docs/install.md does by hand"
     checkout = Path(__file__).parents[2]
     if (checkout / "pyproject.toml").is_file():
-        return f"{sys.executable} -m pip install -e '{checkout}[{extra}]'"
-    return f"{sys.executable} -m pip install 'flockd[{extra}]'"
+        return f"run: {sys.executable} -m pip install -e '{checkout}[{extra}]'"
+    return f"run: {sys.executable} -m pip install 'flockd[{extra}]'"
 
 
 def program() -> NoReturn:
@@ -95,7 +101,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         extra = EXTRAS.get((error.name or "").partition(".")[0])
         if extra is None:
             raise
-        missing = UnavailableError(f"{error.name} is not installed; run: {installing(extra)}")
+        missing = UnavailableError(f"{error.name} is not installed; {installing(extra)}")
         return _failed(str(missing), missing.exit_code)
     except BrokenPipeError:  # the reader of our output has gone; Python would complain once more at its end
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -227,16 +227,16 @@ def write_checked(file: Path, text: str, settings: Sequence[tuple[str, str]] = (
 
 
 def _set(file: Path, key: str, value: str) -> None:
-    """Changes the line of a key, or adds one below its section's; comments stay."""
+    """Changes the line of a key, or adds one below its section's; comments stay. Raises ConfigError inside a list."""
     from flockd.core.config.document import read_document
+    from flockd.core.config.loader import override
 
     path: KeyPath = tuple(key.split("."))
-    places, lines = read_document(file).places, file.read_text(encoding="utf-8").splitlines()
+    document, lines = read_document(file), file.read_text(encoding="utf-8").splitlines()
+    places = dict(document.places)
+    override(document, {key: value})  # refuses what cannot be set
     there = next(length for length in range(len(path), -1, -1) if path[:length] in places)
     line = places[path[:there]].line if there else len(lines)
-    if (*path[:there], 0) in places and there < len(path):
-        section = places[path[:there]].key
-        raise UsageError(f"{section} is a list, whose entries cannot be set one by one; write all of it")
     if there == len(path):
         head = re.fullmatch(r"( *)([^#]*?:)( [^#]*?)?( *#.*)?", lines[line - 1])
         if head is None or head[2] != f"{path[-1]}:":

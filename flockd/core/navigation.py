@@ -49,6 +49,13 @@ def metres_a_degree(latitude_deg: float) -> tuple[float, float]:
     return north, east
 
 
+def metres_from(home_deg: Sequence[float], place_deg: Sequence[float]) -> tuple[float, float]:
+    """How far north and east one place, latitude and longitude, is of another, on a plane there: correct to a few
+    metres within 10 km, to centimetres within 1 km."""
+    north_m, east_m = metres_a_degree((place_deg[0] + home_deg[0]) / 2)
+    return (place_deg[0] - home_deg[0]) * north_m, degrees_apart(place_deg[1], home_deg[1]) * east_m
+
+
 def degrees_apart(longitude_deg: float, other_deg: float) -> float:
     """How far east one longitude is of another, the shorter way around the Earth: from -180 to 180."""
     return (longitude_deg - other_deg + 180.0) % 360.0 - 180.0

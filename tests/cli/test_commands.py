@@ -258,7 +258,7 @@ def test_a_shell_completes_commands_and_options(line: str, words: set[str]) -> N
 @pytest.mark.parametrize(
     ("error", "code", "sentence"),
     [
-        (ModuleNotFoundError("", name="numba"), 69, f"numba is not installed; run: {installing('sim')}"),
+        (ModuleNotFoundError("", name="numba"), 69, f"numba is not installed; {installing('sim')}"),
         (
             OSError(13, "Permission denied", "out"),
             69,
@@ -279,7 +279,7 @@ def test_what_a_flight_lacks_is_one_sentence(
 
 
 def test_an_extra_is_added_to_a_checkout_without_freezing_it() -> None:
-    assert installing("view") == f"{sys.executable} -m pip install -e '{ROOT}[view]'"
+    assert installing("view") == f"run: {sys.executable} -m pip install -e '{ROOT}[view]'"
 
 
 @pytest.fixture

@@ -17,6 +17,9 @@ Distance = Annotated[float, Field(gt=0, le=10_000)]
 """Metres; farther than any of these radios and cameras reach."""
 Speed = Annotated[float, Field(ge=0, le=50)]
 """m/s; faster than any of these vehicles."""
+FARTHEST_M = 100_000.0
+FromHome = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M)]
+"""Metres north or east of home, or of a mission's origin."""
 Share = Annotated[float, Field(ge=0, le=1)]
 Vector3 = tuple[float, float, float]
 
@@ -33,11 +36,11 @@ PlainName = Annotated[str, text(r"^[a-z0-9_-]+$", "a name, of small letters, dig
 
 
 def checked_port(address: str) -> str:
-    """Raises ValueError for a number that is no network port."""
+    """Raises ValueError for a number that is no network port, or 0, which is any."""
     kind, _, rest = address.partition("/")
     port = re.search(r":(\d+)(?:[?#].*)?$", rest)
-    if port and kind.rstrip(":") in _WITH_PORTS and int(port[1]) > 65535:
-        raise ValueError(f"{address} has the port {port[1]}, and the last one is 65535; correct it")
+    if port and kind.rstrip(":") in _WITH_PORTS and not 0 < int(port[1]) <= 65535:
+        raise ValueError(f"{address} has the port {port[1]}; write one from 1 to 65535")
     return address
 
 

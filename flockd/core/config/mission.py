@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from itertools import combinations
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from flockd.core.config.base import Distance, NonNegative, Section, Speed, refuse
+from flockd.core.config.base import FARTHEST_M, Distance, FromHome, NonNegative, Section, Speed, refuse
 from flockd.core.config.safety import GateParameters
-from flockd.core.navigation import is_inside
+from flockd.core.navigation import is_inside, metres_from
 
 MissionKind = Literal["circle_then_tangent", "hover", "velocity", "waypoints", "follow", "operator"]
 AtEnd = Literal["hold", "land", "return"]
 Faults = dict[tuple[str | int, ...], str]
 """What is wrong, by the keys that lead there."""
 
-_Metres = Annotated[float, Field(ge=-100_000, le=100_000)]
 _ONLY_FOR: Mapping[str, MissionKind] = {
     "radius_m": "circle_then_tangent",
     "circle_until_s": "circle_then_tangent",
@@ -31,9 +31,9 @@ _ONLY_FOR: Mapping[str, MissionKind] = {
 class WaypointParameters(Section):
     """A place to fly to: north_m and east_m, or latitude_deg and longitude_deg."""
 
-    north_m: _Metres | None = None
+    north_m: FromHome | None = None
     """From the mission's origin; so `east_m`."""
-    east_m: _Metres | None = None
+    east_m: FromHome | None = None
     latitude_deg: Annotated[float, Field(ge=-85, le=85)] | None = None
     """On the WGS 84 ellipsoid, as maps have it; so `longitude_deg`."""
     longitude_deg: Annotated[float, Field(ge=-180, le=180)] | None = None
@@ -82,7 +82,7 @@ class MissionParameters(Section):
     """Above the ground at home, from the beginning on. null: as high as the drone is then."""
     height_offset_m: Annotated[float, Field(ge=-1000, le=1000)] = 0.0
     """Added to every height of the mission and of an operator's goals, so that drones that share one fly in layers."""
-    origin_m: tuple[_Metres, _Metres] = (0.0, 0.0)
+    origin_m: tuple[FromHome, FromHome] = (0.0, 0.0)
     """Where metres of waypoints and of operators' goals count from, north and east of home. Drones that take off from
     different places and share goals each write their own here."""
 
@@ -124,9 +124,16 @@ def mission_faults(mission: MissionParameters, gate: GateParameters, law_speed_m
     for key, height_m in heights.items():
         if height_m is not None and (fault := fault_of_height(gate, height_m + mission.height_offset_m)):
             faults[key] = fault
+    first_deg: tuple[float, float] | None = None
     for i, waypoint in enumerate(mission.waypoints):
-        if waypoint.north_m is None or waypoint.east_m is None:
-            continue  # in degrees: not before home is known
+        if waypoint.north_m is None or waypoint.east_m is None:  # in degrees: where it is shows before home is known
+            assert waypoint.latitude_deg is not None and waypoint.longitude_deg is not None
+            first_deg = first_deg or (waypoint.latitude_deg, waypoint.longitude_deg)
+            away_m = math.hypot(*metres_from(first_deg, (waypoint.latitude_deg, waypoint.longitude_deg)))
+            if away_m > (across_m := _fence_across_m(gate)):
+                told = f"is {_far(away_m)} from the first of those in degrees"
+                faults["waypoints", i] = f"{told}, and the fence is {across_m:g} m across; correct one"
+            continue
         place = waypoint.north_m + mission.origin_m[0], waypoint.east_m + mission.origin_m[1]
         if outside := fault_of_place(gate, *place):
             faults["waypoints", i] = outside
@@ -167,7 +174,21 @@ def fault_of_place(gate: GateParameters, north_m: float, east_m: float) -> str |
     """What is wrong with a place to fly to, from home; None: it is within the fence."""
     away_m = math.hypot(north_m, east_m)
     if gate.fence_radius_m is not None and away_m > gate.fence_radius_m:
-        return f"is {away_m:.1f} m from home, outside the fence of {gate.fence_radius_m:g} m; write a nearer place"
+        return f"is {_far(away_m)} from home, outside the fence of {gate.fence_radius_m:g} m; write a nearer place"
     if gate.fence_corners_m and not is_inside(gate.fence_corners_m, north_m, east_m):
-        return "is outside safety.gate.fence_corners_m; write a place within"
+        return f"is {_far(away_m)} from home, outside safety.gate.fence_corners_m; write a place within"
     return None
+
+
+def _fence_across_m(gate: GateParameters) -> float:
+    """No two places within the fence are farther apart."""
+    corners = gate.fence_corners_m
+    sides_m = max((math.dist(a, b) for a, b in combinations(corners, 2)), default=math.inf)
+    return min(sides_m, 2 * (FARTHEST_M if gate.fence_radius_m is None else gate.fence_radius_m))
+
+
+def _far(away_m: float) -> str:
+    """A distance; of one that places in metres cannot have, with what is likely of those in degrees."""
+    if away_m > 2 * FARTHEST_M:
+        return f"{away_m / 1000:.0f} km (are latitude and longitude swapped?)"
+    return f"{away_m:.1f} m"

@@ -8,12 +8,11 @@ from pydantic import Field, model_validator
 
 from flockd.core import consistency, services
 from flockd.core.choices import AutopilotMode
-from flockd.core.config.base import Duration, Positive, Section, Share, refuse
-from flockd.core.navigation import crosses_itself
+from flockd.core.config.base import Duration, FromHome, Positive, Section, Share, refuse
+from flockd.core.navigation import crosses_itself, is_inside
 
 LOWEST_LAYER_M, LAYERS_APART_M = 3.0, 4.0
 """Of first flights: a metre more than `vertical_separation_m` for errors of two drones' heights."""
-_Metres = Annotated[float, Field(ge=-100_000, le=100_000)]
 
 
 class GateParameters(Section):
@@ -54,7 +53,7 @@ class GateParameters(Section):
     fence_radius_m: Annotated[float, Field(gt=0, le=100_000)] | None = 100.0
     """Around home, level: the drone brakes before it as before an obstacle; beyond it only inward velocity. null: no
     circle."""
-    fence_corners_m: tuple[tuple[_Metres, _Metres], ...] = ()
+    fence_corners_m: tuple[tuple[FromHome, FromHome], ...] = ()
     """A fence of any shape: its corners north and east of home, in order. With a radius too, both hold."""
     min_height_m: Annotated[float, Field(ge=-1000, le=10_000)] = 1.0
     max_height_m: Annotated[float, Field(ge=-1000, le=10_000)] = 30.0
@@ -77,6 +76,8 @@ class GateParameters(Section):
             raise ValueError("fence_corners_m names a corner twice; delete one, the fence closes by itself")
         if crosses_itself(self.fence_corners_m):
             raise ValueError("fence_corners_m is an outline that crosses itself; write the corners in order around it")
+        if self.fence_corners_m and not is_inside(self.fence_corners_m, 0.0, 0.0):
+            raise ValueError("fence_corners_m leaves home outside, from which they count; write corners around 0, 0")
         return self
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from flockd.core.config.mission import WaypointParameters
 from flockd.core.messages import FloatArray, MissionOrder
-from flockd.core.navigation import degrees_apart, metres_a_degree
+from flockd.core.navigation import metres_from
 
 
 def place_of_order(order: MissionOrder, origin: FloatArray, home_deg: FloatArray | None) -> FloatArray | None:
@@ -14,7 +14,9 @@ def place_of_order(order: MissionOrder, origin: FloatArray, home_deg: FloatArray
     if order.place is not None:
         place: FloatArray = origin + order.place
         return place
-    return None if order.place_deg is None else _from_degrees(order.place_deg, home_deg)
+    if order.place_deg is None or home_deg is None:
+        return None
+    return np.array(metres_from(home_deg.tolist(), order.place_deg.tolist()))
 
 
 def place_of_waypoint(
@@ -25,13 +27,5 @@ def place_of_waypoint(
         place: FloatArray = origin + np.array([waypoint.north_m, waypoint.east_m])
         return place
     assert waypoint.latitude_deg is not None and waypoint.longitude_deg is not None  # checked by WaypointParameters
-    return _from_degrees(np.array([waypoint.latitude_deg, waypoint.longitude_deg]), home_deg)
-
-
-def _from_degrees(place_deg: FloatArray, home_deg: FloatArray | None) -> FloatArray | None:
-    """Metres north and east, on a plane at home: correct to a few metres within 10 km, to centimetres within 1 km."""
-    if home_deg is None:
-        return None
-    across_deg = degrees_apart(float(place_deg[1]), float(home_deg[1]))
-    north_m, east_m = metres_a_degree(float(place_deg[0] + home_deg[0]) / 2)
-    return np.array([(place_deg[0] - home_deg[0]) * north_m, across_deg * east_m])
+    place_deg = waypoint.latitude_deg, waypoint.longitude_deg
+    return None if home_deg is None else np.array(metres_from(home_deg.tolist(), place_deg))

@@ -6,12 +6,11 @@ import math
 
 import numpy as np
 
-from flockd.core.config.mission import MissionParameters
+from flockd.core.config.mission import MissionParameters, fault_of_place
 from flockd.core.config.safety import GateParameters
 from flockd.core.messages import FloatArray
 from flockd.flight.mission.guidance import Guidance, Moment, course_of, towards
 from flockd.flight.mission.places import place_of_waypoint
-from flockd.flight.safety.fence import outside_fence
 
 PATIENCE_S = 5.0
 """A waypoint within this flight time counts as reached if the flock has come no nearer for this time."""
@@ -52,8 +51,8 @@ class Waypoints:
                 self._arrived = True
         if goal is None:
             return self._stands("waits for home in degrees, which the autopilot has not sent")
-        if outside_fence(self._gate, goal):
-            return self._stands(f"{self._name} is outside the fence")
+        if (fault := fault_of_place(self._gate, *goal.tolist())) is not None:
+            return self._stands(f"{self._name} {fault}")
         self._height_m = self._height
         return self._towards(goal, here)
 

@@ -59,7 +59,7 @@ def open_session(
         try:
             _ENDPOINT.validate_python(endpoint)
         except ValidationError:
-            told = "is not a zenoh endpoint; write protocol, address and a port up to 65535, as in `tcp/10.0.0.11:7447`"
+            told = "is not a zenoh endpoint; write protocol, address and port (1 to 65535), as in `tcp/10.0.0.11:7447`"
             raise UnavailableError(f"{purpose}: {endpoint} {told}") from None
     wanted = {
         "mode": "peer",

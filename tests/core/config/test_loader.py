@@ -124,6 +124,20 @@ SLIPS = (
         "safety: {gate: {fence_corners_m: [[-5, -5], [10, 5], [10, -10], [-5, 10]]}}",
         "safety.gate: fence_corners_m is an outline that crosses itself; write the corners in order",
     ),
+    (
+        "safety: {gate: {fence_corners_m: [[5, -5], [5, 5], [15, 0]]}}",
+        "safety.gate: fence_corners_m leaves home outside, from which they count; write corners around 0, 0",
+    ),
+    (  # half-way, at 27.9 degrees, a degree of latitude is 110.84 km and one of longitude 98.46
+        "mission: {kind: waypoints, waypoints: [{latitude_deg: 47.3, longitude_deg: 8.5}, "
+        "{latitude_deg: 8.5, longitude_deg: 47.3}]}",
+        "mission.waypoints[1]: is 5752 km (are latitude and longitude swapped?) from the first of those in degrees",
+    ),
+    (
+        "mission: {kind: waypoints, waypoints: [{north_m: 1, east_m: 1}, {latitude_deg: 47.3, longitude_deg: 8.5}, "
+        "{latitude_deg: 47.303, longitude_deg: 8.5}]}",
+        "mission.waypoints[2]: is 333.5 m from the first of those in degrees, and the fence is 200 m across",
+    ),
     ("geometry: {min_inlier_ratio: 1}", "geometry.min_inlier_ratio: 1 is not less than 1"),
     ("perception: {flow: 5}", "perception.flow: 5 is not a text; put it in quotes"),
     ("perception: {threads: 99999999999999999999}", "perception.threads: 99999999999999999999 is too large"),
@@ -330,11 +344,12 @@ def test_steps_that_a_flight_would_wait_for_are_refused(
 @pytest.mark.parametrize(
     ("key", "value", "told"),
     [
-        ("autopilot.address", "udpin://0.0.0.0:99999", "has the port 99999, and the last one is 65535"),
+        ("autopilot.address", "udpin://0.0.0.0:99999", "has the port 99999; write one from 1 to 65535"),
         ("autopilot.address", "serial:///dev/ttyAMA0:12345", "has the baud rate 12345, which no port has; write"),
         ("autopilot.address", "serial:///dev/serial/by-path/usb-0:1:1", "has the baud rate 1, which no port has"),
         ("telemetry.listen", ("tcp/127.0.0.1:7447", "tls/0.0.0.0:70000?x=1"), "has the port 70000"),
         ("telemetry.connect", ("udp/10.0.0.1:65536",), "has the port 65536"),
+        ("telemetry.listen", ("tcp/0.0.0.0:0",), "has the port 0; write one from 1 to 65535"),
     ],
 )
 def test_an_address_that_nothing_can_open_is_refused(key: str, value: Any, told: str, tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ from flockd.review.report.summary import summarise
 from flockd.sim.flock.start import with_drones
 from flockd.sim.flock.swarm import Flight, fly
 from flockd.sim.scenario import ScenarioConfig, load_scenario
+from flockd.sim.sitl.processes import free_endpoint
 from tests.make import small_eyes
 from tests.sim.flock.watching import Watching
 
@@ -115,7 +116,7 @@ class Tampering:
 
 def test_drones_fly_blind_to_each_others_telemetry(alone: FlightLog) -> None:
     """Cut, or real and tampered with: bit for bit the same flight."""
-    with ZenohTelemetry("test", listen=("tcp/127.0.0.1:0",)) as zenoh:
+    with ZenohTelemetry("test", listen=(free_endpoint(),)) as zenoh:
         tampered = Tampering(zenoh)
         assert_same_flight(alone, flown(tampered))
     assert {drone for drone, _ in tampered.told} == {"drone1", "drone2"}
