@@ -182,6 +182,11 @@ def _judge(days: Fortnight) -> None:
     assert len(gone) >= flights + 1 - count, "and each was told"
     assert not any("the recording ends here" in event for event in days.told)
     (files, threads, mb), (files_now, threads_now, mb_now) = days.left[0], days.left[-1]
+    print(  # noqa: T201 - figures
+        f"{flights} flights, {count} recordings of {sum((days.folder / name).stat().st_size for name in kept)} bytes "
+        f"kept, {len(gone)} deleted for room; files {files} -> {files_now}, threads {threads} -> {threads_now}, "
+        f"memory {mb:.0f} -> {mb_now:.0f} MB"
+    )
     assert files_now - files <= MORE_FILES, days.left
     assert threads_now == threads, days.left
     assert mb_now - mb <= MORE_MB_A_FLIGHT * flights, days.left

@@ -74,7 +74,8 @@ RESTARTED_MS = 1000
 """A stamp that goes back by this much comes from a restarted clock."""
 OTHER_CLOCK_MS, CLOCK_STAMPS, CLOCK_RETURNS = 100, 50, 3
 """Two autopilots of one id: so many of the last stamps are so much older than the stamp before, as the stamps of two
-clocks take turns. A restart goes back once, and packets of one autopilot that overtake each other by less."""
+clocks take turns. A restart goes back once, packets of one autopilot that overtake each other by less, and those that
+come over a second, slower way too have stamps that were there before."""
 STAMPS_END_MS, NEAR_END_MS = 1 << 32, 10_000
 """Stamps wrap here to 0; and how near to the wrap two successive stamps have to be to count as one."""
 MAV_SEVERITY_WARNING = 4
@@ -130,8 +131,11 @@ class ReceivedMessages:
         self._max_gap_s = max_gap_s
         self._boot_ms = self._stamp_ms = 0
         self._returns: deque[bool] = deque(maxlen=CLOCK_STAMPS)
-        self.two_clocks = False
-        """Whether stamps of two clocks were received: another autopilot has the same id."""
+        self._stamps_ms: deque[int] = deque(maxlen=CLOCK_STAMPS)
+        self._board: list[int] | None = None
+        """The serial number of its board's processor, of PX4's simulator its instance; None: not known."""
+        self.are_two = False
+        """Whether stamps of two clocks or numbers of two boards were received: another autopilot has the same id."""
         self._counted_ms = 0
         """Milliseconds lost by wraps of 32-bit stamps since flockd listens: they wrap after 49.7 days."""
         self.restarts = 0
@@ -191,6 +195,10 @@ class ReceivedMessages:
             self._take_landing(status.landed_state)
         elif name == "HOME_POSITION":
             self._take_home()
+        elif name == "AUTOPILOT_VERSION" and isinstance(board := self._fields(name).get("uid2"), list) and any(board):
+            if self._board not in (None, board):
+                self._tell_two()
+            self._board = board
         if name in ("HEARTBEAT", "CURRENT_MODE") and self.flight_mode() != "offboard":
             self._frame.large = False  # the flight with it is over
 
@@ -233,12 +241,13 @@ class ReceivedMessages:
 
         An armed autopilot cannot restart: then a stamp from the past is wrong, or another sender's.
         """
-        self._returns.append(boot_ms < self._stamp_ms - OTHER_CLOCK_MS)
+        new = len(self._stamps_ms) == CLOCK_STAMPS and boot_ms not in self._stamps_ms
+        self._returns.append(new and boot_ms < self._stamp_ms - OTHER_CLOCK_MS)
+        self._stamps_ms.append(boot_ms)
         self._stamp_ms = boot_ms
-        if not self.two_clocks and sum(self._returns) >= CLOCK_RETURNS:
-            self.two_clocks = True
-            self._report("two autopilots with the same system id are heard; their messages cannot be told apart")
-        if self.two_clocks:
+        if sum(self._returns) >= CLOCK_RETURNS:
+            self._tell_two()
+        if self.are_two:
             return
         if boot_ms < NEAR_END_MS and self._boot_ms > STAMPS_END_MS - NEAR_END_MS:
             self._counted_ms += STAMPS_END_MS
@@ -246,10 +255,15 @@ class ReceivedMessages:
             if int(self._fields("HEARTBEAT").get("base_mode") or 0) & MAV_MODE_FLAG_SAFETY_ARMED:
                 return
             self.restarts += 1
-            self._counted_ms = 0
+            self._counted_ms, self._board = 0, None
             self.check_events, self.clock = CheckEvents(), ClockSync()
             self._report("the autopilot has started anew")
         self._boot_ms = boot_ms
+
+    def _tell_two(self) -> None:
+        if not self.are_two:
+            self._report("two autopilots with the same system id are heard; their messages cannot be told apart")
+        self.are_two = True
 
     def _take_text(self, text: str, severity: int, time_s: float) -> None:
         if severity > MAV_SEVERITY_WARNING:

@@ -86,8 +86,9 @@ REASON_S = 0.5
 """Time for which a refusal waits for the autopilot's text, which follows it."""
 ATTEND_S, ANNOUNCE_S = 0.25, 1.0
 """Time between two checks for missing data, and two readings of a parameter; time between two announcements."""
-CHECKS_AGAIN_S = 1.0
-"""Time between two requests for the list of failed checks after events were lost."""
+CHECKS_AGAIN_S, VERSION_AGAIN_S = 1.0, 10.0
+"""Time between two requests for the list of failed checks after events were lost; and for the version, which has the
+board's serial number: another autopilot of this id answers too."""
 ANNOUNCEMENT = {
     "type": 6, "autopilot": 8, "base_mode": 0, "custom_mode": 0, "system_status": 4, "mavlink_version": 3
 }  # fmt: skip
@@ -233,7 +234,7 @@ class AutopilotLink:
             )
         if len(self._heard) > 1:
             return _ambiguous(self._parameters.address, self._heard)
-        if self.received.two_clocks:
+        if self.received.are_two:
             return AutopilotSettingError(
                 f"autopilot.system_id: two autopilots of system {self._system_id} are heard at "
                 f"{self._parameters.address}; disconnect the other one, or give it another MAV_SYS_ID"
@@ -307,12 +308,16 @@ class AutopilotLink:
         return acts == 0 and self.received.flight_mode() != "mission"
 
     async def _request_what_is_missing(self) -> None:
-        beginnings, asked_s = self._beginnings(), -math.inf
+        beginnings, asked_s, version_s = self._beginnings(), -math.inf, -math.inf
         while True:
             if self.received.check_events.lost and self._clock() - asked_s >= CHECKS_AGAIN_S:
                 asked_s = self._clock()
                 with suppress(AutopilotError):
                     await self.ask_for_checks()
+            if self._clock() - version_s >= VERSION_AGAIN_S:
+                version_s = self._clock()
+                with suppress(AutopilotError):
+                    await self._command("for its version", COMMAND_REQUEST_MESSAGE, 148)
             if self._beginnings() != beginnings:
                 beginnings = self._beginnings()
                 await self._request_streams()

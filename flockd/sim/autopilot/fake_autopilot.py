@@ -8,6 +8,7 @@ second only. Where PX4 does more (climbing before a return, position control in 
 from __future__ import annotations
 
 import math
+import os
 import socket
 import struct
 import threading
@@ -113,8 +114,8 @@ class FakeAutopilot:
         self.drift.velocity, self.drift.position = np.zeros(3), np.zeros(2)
         self.failing: set[str] = set()
         """PX4's names of further checks that fail; each refuses to arm."""
-        self.silent = False
-        """True: as if the cable were cut, in both directions."""
+        self.silent, self.board = False, list(os.urandom(18))
+        """`silent`, True: as if the cable were cut, in both directions; `board`: the serial number of its processor."""
         self.parameters: dict[str, float | int] = {
             "COM_OF_LOSS_T": 1.0,
             "COM_OBL_RC_ACT": 5,
@@ -448,7 +449,7 @@ class FakeAutopilot:
                 self.checks.tell(self._failing())
                 done = True
             case mavlink.MAV_CMD_REQUEST_MESSAGE if message.param1 == mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION:
-                self.streams.send_version()
+                self.streams.send_version(self.board)
                 done = True
             case _:
                 return int(mavlink.MAV_RESULT_UNSUPPORTED)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -175,11 +175,11 @@ class TelemetryStreams:
         longitude_deg += position[1] / east_m
         return round(1e7 * latitude_deg), round(1e7 * longitude_deg), round(-1000.0 * position[2])
 
-    def send_version(self) -> None:
-        """Sends a version that no PX4 has, so that it cannot be mistaken for one."""
+    def send_version(self, board: Sequence[int]) -> None:
+        """Sends a version that no PX4 has, so that it cannot be mistaken for one; ``board``: its 18 bytes."""
         capabilities = mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2 | mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
         nothing = [0] * 8
-        self._mav.autopilot_version_send(capabilities, 0x00000100, 0, 0, 0, nothing, nothing, nothing, 0, 0, 0)
+        self._mav.autopilot_version_send(capabilities, 0x00000100, 0, 0, 0, nothing, nothing, nothing, 0, 0, 0, board)
 
 
 def _wxyz(R_ned_body: FloatArray) -> list[float]:

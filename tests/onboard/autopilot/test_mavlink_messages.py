@@ -184,13 +184,40 @@ def test_a_stamp_from_the_past_is_a_restart_on_the_ground_and_nothing_in_flight(
         ([60_000, 59_880, 60_020, 59_900, 60_040, 59_920], True),
         ([60_000, 0, 20, 40, 60, 80, 0, 20, 40], False),
         ([60_000, 60_040, 60_020, 60_080, 60_060, 60_120, 60_100, 60_160, 60_140], False),
+        ([stamp - late for stamp in range(59_800, 60_600, 20) for late in (0, 120)], False),
     ],
-    ids=["far apart", "started with one switch", "restarted twice", "overtaken packets"],
+    ids=["far apart", "started with one switch", "restarted twice", "overtaken packets", "over a second, slower way"],
 )
 def test_two_autopilots_of_one_id_are_told_apart_by_their_clocks(stamps: list[int], two: bool, armed: bool) -> None:
     heartbeat = ("HEARTBEAT", {"base_mode": 128 * armed, "custom_mode": 0, "system_status": 4})
-    received, log = _received(heartbeat, *(("ATTITUDE_QUATERNION", {"time_boot_ms": stamp}) for stamp in stamps))
-    assert received.two_clocks is two
+    before = range(58_000, 59_800, 20)  # one alone
+    received, log = _received(
+        heartbeat, *(("ATTITUDE_QUATERNION", {"time_boot_ms": stamp}) for stamp in [*before, *stamps])
+    )
+    assert received.are_two is two
+    assert sum("two autopilots with the same system id" in text for text in log) == two
+
+
+def test_a_slower_way_that_is_there_from_the_beginning_is_no_second_autopilot() -> None:
+    """The first of its stamps were never heard over the faster one."""
+    stamps = [stamp - late for stamp in range(60_000, 63_000, 20) for late in (0, 120)]
+    received, _ = _received(*(("ATTITUDE_QUATERNION", {"time_boot_ms": stamp}) for stamp in stamps))
+    assert not received.are_two
+
+
+@pytest.mark.parametrize(
+    ("boards", "two"),
+    [([1, 1, 1], False), ([1, 2], True), ([0, 1, 0, 1], False), ([1, "restart", 2], False)],
+    ids=["one", "two", "sometimes unknown", "another one after a restart"],
+)
+def test_two_whose_clocks_agree_are_told_apart_by_their_boards(boards: list[int | str], two: bool) -> None:
+    """`uid2` of AUTOPILOT_VERSION, PX4's processor's number, of its simulator the instance's."""
+    told: dict[str, list[tuple[str, Any]]] = {
+        "restart": [("ATTITUDE_QUATERNION", {"time_boot_ms": stamp}) for stamp in (60_000, 0)]
+    }
+    messages = [told.get(str(one), [("AUTOPILOT_VERSION", {"uid2": [one] * 18})]) for one in boards]
+    received, log = _received(*(message for some in messages for message in some))
+    assert received.are_two is two
     assert sum("two autopilots with the same system id" in text for text in log) == two
 
 

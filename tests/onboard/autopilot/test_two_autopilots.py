@@ -8,6 +8,7 @@ import pytest
 
 from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.errors import ExitCode
+from flockd.onboard.autopilot import mavlink_messages, mavsdk_link
 from flockd.onboard.autopilot.autopilot_status import AutopilotError
 from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
@@ -60,14 +61,21 @@ async def test_a_second_one_that_comes_later_is_told_and_ends_it(
 
 @pytest.mark.fault("serial-port")
 @pytest.mark.parametrize("system_id", [1, None])
-async def test_one_of_the_same_id_is_told_by_its_clock_once_and_ends_it(
-    port: int, address: str, fake_autopilot: FakeAutopilot, system_id: int | None
-) -> None:
+@pytest.mark.parametrize("clocks_agree", [False, True])
+async def test_one_of_the_same_id_is_told_by_its_clock_or_its_board_once_and_ends_it(
+    port: int, address: str, fake_autopilot: FakeAutopilot, system_id: int | None, clocks_agree: bool,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.setattr(mavsdk_link, "VERSION_AGAIN_S", 0.5)
     async with attended(address, system_id=system_id) as link:
         await until(lambda: link.vehicle_state() is not None)
         await asyncio.sleep(1.0)
         assert link.unusable() is None
-        with _neighbour(port, system_id=1):
+        with _neighbour(port, system_id=1) as neighbour:
+            if clocks_agree:
+                monkeypatch.setattr(mavlink_messages, "OTHER_CLOCK_MS", 1 << 40)
+            else:
+                neighbour.board = fake_autopilot.board
             await until(lambda: link.unusable() is not None)
             error = link.unusable()
             assert error is not None
