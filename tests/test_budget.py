@@ -20,16 +20,16 @@ from flockd.onboard.recording.reader import Recording
 
 ROOT = Path(__file__).parents[1]
 LINES = {
-    "flockd/core": 3_270,
+    "flockd/core": 3_300,
     "flockd/flight": 11_130,
-    "flockd/onboard": 9_350,
+    "flockd/onboard": 9_360,
     "flockd/fleet": 2_730,
     "flockd/ground": 5_040,
     "flockd/review": 3_600,
     "flockd/sim": 8_770,
     "flockd/campaign": 1_490,
-    "flockd/cli": 3_720,
-    "tests": 39_230,
+    "flockd/cli": 3_750,
+    "tests": 39_260,
     "tools/checks": 2_060,
     "tools/docs": 930,
     "tools/measure": 1_520,

@@ -26,10 +26,18 @@ LONGEST_OPERATOR = 40
 
 def add_endpoint_options(parser: Parser, listen: str = "--listen") -> None:
     """Adds the fleet's name and the endpoints; ``listen``: the option for where drones connect to."""
-    option(parser, "--fleet NAME", "watch only this fleet; by default all that are found")
+    option(parser, "--fleet NAME", "watch only this fleet; by default all that are found", _fleet)
     option(parser, "--connect ENDPOINT", f"connect to this drone or router; by default {ENDPOINT}", action="append")
     parser.add_argument(listen, metavar="ENDPOINT", action="append", dest="drones_at", help="where drones connect to")
     option(parser, "--zenoh-config FILE", "a file of zenoh's settings, for example for TLS", Path)
+
+
+def _fleet(text: str) -> str:
+    from flockd.onboard.telemetry.topics import is_name
+
+    if not is_name(text):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a fleet's name, of letters, digits, `_`, `.` and `-`")
+    return text
 
 
 def add_operator_option(parser: Parser) -> None:

@@ -123,6 +123,19 @@ def commands_of(parser: Parser) -> Commands:
     return add
 
 
+class _Once(argparse.Action):
+    """Stores an option's value, and refuses another one: argparse would take the last without a word."""
+
+    def __call__(
+        self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, _: str | None = None
+    ) -> None:
+        given: set[str] = vars(namespace).setdefault("given", set())
+        if self.dest in given:
+            raise argparse.ArgumentError(self, "is given twice; leave one out")
+        given.add(self.dest)
+        setattr(namespace, self.dest, values)
+
+
 def option(
     parser: argparse._ActionsContainer, spelling: str, what: str, kind: Callable[[str], Any] = str, **more: Any
 ) -> None:
@@ -135,6 +148,8 @@ def option(
         name, value = name.lower(), name
     if value:
         more["metavar"] = value
+    if name.startswith("-"):
+        more.setdefault("action", _Once)
     parser.add_argument(name, help=what, type=kind, **more)
 
 

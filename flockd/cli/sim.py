@@ -263,10 +263,11 @@ def _scenario(args: argparse.Namespace) -> ScenarioConfig:
     from flockd.sim.flock.start import with_drones
     from flockd.sim.scenario import load_scenario
 
-    overrides: Overrides = {
-        **{key: _value(key, text) for key, text in args.settings},
-        **{key: getattr(args, option) for option, key in OPTIONS.items() if getattr(args, option) is not None},
-    }
+    options = {key: getattr(args, option) for option, key in OPTIONS.items() if getattr(args, option) is not None}
+    twice = [key for key, _ in args.settings if key in options or (key == "vehicles" and args.drones is not None)]
+    if twice:
+        raise UsageError(f"--set {twice[0]} says what an option says too; leave one out")
+    overrides: Overrides = {**{key: _value(key, text) for key, text in args.settings}, **options}
     try:
         scenario = load_scenario(args.scenario or data_path("config") / SCENARIO, overrides)
     except ConfigError as error:

@@ -393,8 +393,8 @@ class ScenarioConfig(Section):
                 yield place, f"{below}write {-max(down_m, _LOWEST_M):g}"
             elif down_m > -_LOWEST_M:
                 yield place, f"{above}-{_LOWEST_M:g} or less as the third number"
-            elif down_m < -_HIGHEST_M:
-                yield place, f"{above}-{_HIGHEST_M:g} or more as the third number"
+            elif down_m < -(most_m := _HIGHEST_M if vehicle.by_hand else self.drone.safety.gate.max_height_m):
+                yield place, f"{above}-{most_m:g} or more as the third number, or raise safety.gate.max_height_m"
         for one, other in combinations(range(len(self.vehicles)), 2):
             apart_m = dist(self.vehicles[one].position_m, self.vehicles[other].position_m)
             if apart_m < MIN_START_DISTANCE_M:

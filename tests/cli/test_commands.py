@@ -76,6 +76,8 @@ def test_version(told: Told) -> None:
     [
         (["sims"], "flockd", "did you mean `flockd sim`?"),
         (["status", "--once"], "flockd status", "unknown argument --once"),
+        (["status", "--fleet", "a/b"], "flockd status", "--fleet: 'a/b' is not a fleet's name, of letters"),
+        (["run", "--config", "a.yaml", "--config", "b.yaml"], "flockd run", "--config: is given twice; leave one out"),
         (["calibrate", "camera", "--once", "2"], "flockd calibrate camera", "unknown argument --once"),
         (["record", "xyz"], "flockd record", "'xyz' is not a command, of info"),
         (["fleet", "--port", "99999"], "flockd fleet", "--port: '99999'"),
@@ -134,6 +136,8 @@ def test_without_a_command_the_help_is_shown(command: list[str], capsys: Capture
         (["--perception", "truth", "--record"], 2, "--record has no meaning without networks"),
         (["--set", "vehicle.wind=[2, -1.5]"], 78, "--set: vehicle.wind: is not a known key"),
         (["--set", "seed=[2"], 2, "is not YAML"),
+        (["--seed", "1", "--set", "seed=2"], 2, "--set seed says what an option says too; leave one out"),
+        (["--drones", "3", "--set", "vehicles=[]"], 2, "--set vehicles says what an option says too; leave one out"),
         (["--duration", "0.1"], 78, "--duration: 0.1 s is shorter than a step of 0.5 s"),
         (["--live", "--record"], 2, "--live keeps nothing"),
         (["--live", "--telemetry"], 2, "--live has --telemetry in it"),
@@ -321,7 +325,7 @@ def test_each_flight_has_its_own_folder(tmp_path: Path, monkeypatch: pytest.Monk
     short = (*TRUTH, "--duration", "2", "--quiet")
     for expected in ("", "-2", "-3"):
         assert told(0, *short) == f"out/paper_flight-truth-duration_2-seed0{expected}/report.html\n"
-    windy = (*short, "--set", "vehicle.wind_m_s=[3,-1.5]", "--drones", "3", "--no-gate", "--duration", "3")
+    windy = (*TRUTH, "--quiet", "--set", "vehicle.wind_m_s=[3,-1.5]", "--drones=3", "--no-gate", "--duration", "3")
     folder = "out/paper_flight-truth-duration_3-drones_3-wind_m_s_3,-1.5-no-gate-seed0"
     assert told(0, *windy) == f"{folder}/report.html\n"
 

@@ -230,7 +230,13 @@ def _syntax_problem(file: str, text: str, error: yaml.MarkedYAMLError) -> Config
     line = mark.line + 1
     problem = error.problem or ""
     opened = error.context_mark.line + 1 if error.context_mark is not None else line
-    if "'\\t'" in problem:
+    spaced = next((at for at in (line, opened, line - 1) if at and re.search(r"[^\S \t\r]", lines[at - 1])), None)
+    dashed = next((at for at in (opened, line, line - 1) if at and re.match(r" *-[\w{\[]", lines[at - 1])), None)
+    if spaced is not None:
+        line, message = spaced, "another space than the keyboard's stands here, as web pages have it; write a plain one"
+    elif dashed is not None and "cannot start" not in problem:
+        line, message = dashed, "put a space after the `-`"
+    elif "'\\t'" in problem:
         message = "a tab stands where YAML needs spaces; indent and separate with spaces"
     elif "cannot start any token" in problem:
         sign = problem.split("'")[1]

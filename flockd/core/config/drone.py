@@ -24,6 +24,7 @@ from flockd.core.config.rig import RigConfig
 from flockd.core.config.safety import SafetyParameters
 from flockd.core.config.source import CameraDeviceParameters, SourceParameters
 from flockd.core.config.tracking import TrackingParameters
+from flockd.core.secrets import masked
 
 
 class RecordingConfig(Section):
@@ -57,6 +58,14 @@ class TelemetryParameters(Section):
     commands: tuple[OperatorCommand, ...] = ()
     """Commands that operators may send over telemetry; by default none. `goto` and `velocity` change the drone's
     mission until the flight ends."""
+
+    @model_validator(mode="after")
+    def _endpoints_differ(self) -> Self:
+        endpoints = (*self.listen, *self.connect)
+        twice = next((one for number, one in enumerate(endpoints) if one in endpoints[:number]), None)
+        if twice is not None:
+            raise ValueError(f"{masked(twice)} is named twice in listen and connect; delete one")
+        return self
 
 
 class DroneConfig(Section):
@@ -106,6 +115,10 @@ class DroneConfig(Section):
             )
         if self.autopilot is not None:
             faults |= self._late_steps()
+        if self.flocking.desired_distance_m >= self.flocking.observation_distance_m:
+            far_m = self.flocking.observation_distance_m
+            told = f"is not below observation_distance_m {far_m:g}, beyond which no drone counts; write a smaller one"
+            faults["flocking", "desired_distance_m"] = f"{self.flocking.desired_distance_m:g} {told}"
         if self.flocking.size == "learn" and self.perception.drone_size_m is not None:
             faults["flocking", "size"] = "learns what perception.drone_size_m says; delete one of the two"
         elif self.flocking.size == "learn" and self.perception.distance == NO_MODEL:
@@ -115,6 +128,10 @@ class DroneConfig(Section):
             faults["source", "shared_memory", "speed_factor"] = fault
         if self.source is not None and self.source.kind != "shared_memory":
             faults |= self._device_faults(self.source.cameras)
+            rate_hz = max(camera.rate_hz for camera in self.source.cameras) if self.source.cameras else 1e3
+            if self.step_s * rate_hz < 1.0 and not math.isclose(self.step_s * rate_hz, 1.0):
+                told = f"{self.step_s:g} s is below the {1 / rate_hz:.3f} s between two images of the fastest camera"
+                faults["step_s",] = f"{told}; write a larger one"
         refuse(self, faults)
         return self
 

@@ -119,6 +119,12 @@ def mission_faults(mission: MissionParameters, gate: GateParameters, law_speed_m
     """What the gate and the law, up to `law_speed_m_s`, would not permit of a mission; by key."""
     limit_m_s = min(law_speed_m_s, gate.max_speed_m_s)
     faults = _faults_of_speeds(mission, limit_m_s)
+    if mission.kind == "circle_then_tangent":
+        turned_rad = min(mission.speed_m_s * mission.circle_until_s / mission.radius_m, math.pi)
+        away_m, across_m = 2 * mission.radius_m * math.sin(turned_rad / 2), _fence_across_m(gate)
+        if away_m > across_m:
+            told = f"leads {away_m:.0f} m away on the circle, and the fence is {across_m:g} m across"
+            faults["radius_m",] = f"{told}; write a smaller one"
     heights: dict[tuple[str | int, ...], float | None] = {("height_m",): mission.height_m}
     heights |= {("waypoints", i, "height_m"): waypoint.height_m for i, waypoint in enumerate(mission.waypoints)}
     for key, height_m in heights.items():
@@ -190,5 +196,5 @@ def _fence_across_m(gate: GateParameters) -> float:
 def _far(away_m: float) -> str:
     """A distance; of one that places in metres cannot have, with what is likely of those in degrees."""
     if away_m > 2 * FARTHEST_M:
-        return f"{away_m / 1000:.0f} km (are latitude and longitude swapped?)"
+        return f"{away_m / 1000:.0f} km (are latitude and longitude swapped, or a sign?)"
     return f"{away_m:.1f} m"

@@ -131,7 +131,10 @@ def _of_kalibr(name: str, values: Mapping[str, Any]) -> ForeignLens:
 
 def _of_matrices(values: Mapping[str, Any], name: str, size: tuple[int, int] | None) -> ForeignLens:
     """Of ROS and OpenCV."""
-    matrix = np.array(values["camera_matrix"]["data"], np.float64).reshape(3, 3)
+    matrix = np.array(values["camera_matrix"]["data"], np.float64)
+    if matrix.size != 9 or not matrix.any():
+        raise ValueError(f"the camera_matrix, {matrix.size} numbers{'' if matrix.any() else ' that are 0'}")
+    matrix = matrix.reshape(3, 3)
     distortion = values.get("distortion_coefficients", {"data": ()})["data"]
     if "image_width" in values:
         size = values["image_width"], values["image_height"]

@@ -103,7 +103,7 @@ def _decoded(path: Path, flags: int) -> cv2.typing.MatLike:
                     damage = said()
                 if image is not None and damage:
                     image, fault = None, f"is damaged inside ({damage})"
-            fault = fault or "is no image"
+            fault = fault or next((told for head, told in _OTHERS.items() if data.startswith(head)), "is no image")
     except (OSError, ValueError) as error:  # ValueError: what a list names cannot be a path
         fault = f"cannot be read ({error.strerror if isinstance(error, OSError) else error})"
     except cv2.error:  # of a header that claims more pixels than OpenCV is to take, or of no bytes at all
@@ -113,6 +113,14 @@ def _decoded(path: Path, flags: int) -> cv2.typing.MatLike:
     if image is None:
         raise DatasetError(f"{path}: {fault}; restore it, or leave its frame out")
     return image
+
+
+_OTHERS = {
+    **dict.fromkeys((b"GIF8", b"P1", b"P2", b"P3", b"\0\0\0\x0cjP"), "is of a format that is not read; save it as PNG"),
+    **dict.fromkeys((b"\x1f\x8b", b"PK\x03\x04", b"\x28\xb5\x2f\xfd"), "is packed; unpack it"),
+    **dict.fromkeys((b"%PDF", b"<svg", b"<?xml"), "is a document; save its picture as PNG"),
+}
+"""How files begin that have an image's name and are none."""
 
 
 def _fault(data: bytes) -> str | None:
@@ -208,6 +216,8 @@ def images_of_video(path: Path, every: int = 1) -> Iterator[tuple[int, float, UI
         count, rate_hz = video.get(cv2.CAP_PROP_FRAME_COUNT), video.get(cv2.CAP_PROP_FPS)
         index, last_s = 0, 0.0
         while video.grab():
+            if count < 0 and path.suffix.lower() in _COUNTED:
+                raise DatasetError(f"{path}: lacks its beginning, or its list of frames; restore it")
             last_s = video.get(cv2.CAP_PROP_POS_MSEC) / 1e3
             if index % every == 0:
                 there, image = video.retrieve()

@@ -29,6 +29,14 @@ SYNC_EVERY_S = 1.0
 """The most that a loss of power costs, if the disk keeps what it confirms."""
 _KNOWN = {Opcode.CHUNK, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.METADATA, Opcode.ATTACHMENT}
 _MAGIC = b"\x89MCAP0\r\n"
+_UNKNOWN = "it does not begin as MCAP files do); name another file"
+_OTHERS = {
+    b"#ROSBAG": "but a bag of ROS 1); make one of ROS 2 of it with `rosbags-convert`",
+    b"ULog": "but PX4's log); open it in Flight Review or PlotJuggler",
+    b"\x28\xb5\x2f\xfd": "but packed by zstd); unpack it with `unzstd`",
+    b"\x1f\x8b": "but packed by gzip); unpack it with `gunzip`",
+}
+"""How other files begin that are taken for recordings."""
 _HEAD = struct.Struct("<BQ")
 MAX_RECORD_BYTES = 256 << 20
 """Largest record, and chunk uncompressed; larger ones count as damaged. The largest real ones hold one image."""
@@ -182,8 +190,9 @@ def read_records(path: Path) -> Iterator[Record | Damage]:
     it is not an MCAP file, and OSError.
     """
     with path.open("rb") as file:
-        if file.read(len(_MAGIC)) != _MAGIC:
-            raise RecordingError(f"{path}: is not a recording (it does not begin as MCAP files do); name another file")
+        if (head := file.read(len(_MAGIC))) != _MAGIC:
+            told = next((told for others, told in _OTHERS.items() if head.startswith(others)), _UNKNOWN)
+            raise RecordingError(f"{path}: is not a recording ({told}")
         yield from _Reader(file).records()
 
 

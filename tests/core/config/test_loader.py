@@ -128,10 +128,23 @@ SLIPS = (
         "safety: {gate: {fence_corners_m: [[5, -5], [5, 5], [15, 0]]}}",
         "safety.gate: fence_corners_m leaves home outside, from which they count; write corners around 0, 0",
     ),
+    (
+        "mission: {radius_m: 101, circle_until_s: 999}",
+        "mission.radius_m: leads 202 m away on the circle, and the fence is 200 m across",
+    ),
+    (
+        "mission: {radius_m: 1e3, circle_until_s: 500}",
+        "mission.radius_m: leads 495 m away on the circle, and the fence",
+    ),
+    ("flocking: {desired_distance_m: 20}", "flocking.desired_distance_m: 20 is not below observation_distance_m 20"),
+    ("telemetry: {listen: ['tcp/[::1]:1'], connect: ['tcp/[::1]:1']}", "telemetry: tcp/[::1]:1 is named twice in"),
+    ("name: ..", "name: .. is not a name; write"),
+    (f"name: {'n' * 65}", "name: nnnnnnnnnn"),
+    ("yaw:\u00a0hold", "another space than the keyboard's stands here, as web pages have it; write a plain one"),
     (  # half-way, at 27.9 degrees, a degree of latitude is 110.84 km and one of longitude 98.46
         "mission: {kind: waypoints, waypoints: [{latitude_deg: 47.3, longitude_deg: 8.5}, "
         "{latitude_deg: 8.5, longitude_deg: 47.3}]}",
-        "mission.waypoints[1]: is 5752 km (are latitude and longitude swapped?) from the first of those in degrees",
+        "mission.waypoints[1]: is 5752 km (are latitude and longitude swapped, or a sign?) from the first",
     ),
     (
         "mission: {kind: waypoints, waypoints: [{north_m: 1, east_m: 1}, {latitude_deg: 47.3, longitude_deg: 8.5}, "

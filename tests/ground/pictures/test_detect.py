@@ -252,13 +252,15 @@ def test_a_size_that_no_drone_has_is_refused(capsys: Capture, size_m: str) -> No
     [
         ("a.jpg", b"", "is empty"),
         ("a.jpg", b"no picture", "is no image"),
+        ("a.png", b"GIF89a" + bytes(99), "is of a format that is not read; save it as PNG"),
+        ("a.jpg", b"\x1f\x8b\x08" + bytes(99), "is packed; unpack it"),
         ("a.jpg", NEAR.read_bytes()[:9000], "the JPEG ends too early"),
         ("a.jpg", b"P6\n60000 60000\n255\n", "has more pixels than any camera, or none"),
         ("a.jpg", b"P6\n600 600\n255\n", "is no image"),
         ("a.ppm", b"P6\n40 31\n255\n" + bytes(40 * 31 * 3), "is 40 x 31 pixels, and 32 x 32 are needed"),
         ("a.mp4", b"no video", "cannot be decoded as a video"),
     ],
-    ids=["empty", "text", "cut", "huge PPM", "cut PPM", "small", "video"],
+    ids=["empty", "text", "GIF", "gzip", "cut", "huge PPM", "cut PPM", "small", "video"],
 )
 def test_a_picture_that_cannot_be_read_ends_it(
     capsys: Capture, tmp_path: Path, name: str, content: bytes, sentence: str
@@ -315,6 +317,18 @@ def test_a_video_that_is_damaged_in_the_middle_is_told_with_how_much_was_read(ca
     assert "kinds that are not read (1 .heic)" in kinds
     assert f"{video}: is damaged: {result['images']} of its 12 frames were read" in damage
     assert 3 <= result["images"] <= 7
+
+
+def test_a_video_without_its_beginning_is_refused(capsys: Capture, tmp_path: Path) -> None:
+    """FFmpeg finds frames in it, and makes up their times."""
+    video = tmp_path / "clip.mp4"
+    writer = cv2.VideoWriter(str(video), cv2.VideoWriter.fourcc(*"mp4v"), 10.0, SIZE)
+    for image in np.random.default_rng(0).integers(0, 255, (6, *SIZE[::-1], 3), np.uint8):
+        writer.write(image)
+    writer.release()
+    data = video.read_bytes()
+    video.write_bytes(data[len(data) // 2 :])
+    assert f"{video}: lacks its beginning, or its list of frames; restore it" in told(capsys, 1, "detect", video, *FOV)
 
 
 @pytest.mark.parametrize(
