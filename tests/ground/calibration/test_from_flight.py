@@ -191,15 +191,19 @@ def test_a_recording_without_images_says_so(tmp_path: Path, monkeypatch: pytest.
     assert (finding.level, finding.about) == (Level.WARNING, "rig")
 
 
-def test_the_doctor_does_not_count_a_camera_of_which_the_flight_showed_nothing(
+def test_the_doctor_names_a_camera_of_which_the_flight_showed_nothing_though_it_showed_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     recorded(tmp_path)
     right = np.zeros(3), 0.0, 1.0
     unseen = seen("left", *right, sigmas=(PRIOR_TURN_RAD,) * 3 + WELL[3:])
-    (finding,) = examined(monkeypatch, drone_config(), tmp_path, seen("front", *right), unseen)
-    assert finding.level is Level.PASS
-    assert finding.measured.endswith("saw 1 cameras as they are configured, and shows nothing of left")
+    left, rig = examined(monkeypatch, drone_config(), tmp_path, seen("front", *right), unseen)
+    assert (left.level, left.about) == (Level.WARNING, "camera left")
+    assert rig.level is Level.PASS
+    assert rig.measured.endswith("saw 1 cameras as they are configured")
+    still = [replace(unseen, camera=name) for name in ("front", "left")]
+    (rig,) = examined(monkeypatch, drone_config(), tmp_path, *still)
+    assert (rig.level, rig.about) == (Level.PASS, "rig")
 
 
 def test_the_doctor_compares_the_newest_recording_with_the_configuration(
