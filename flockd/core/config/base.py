@@ -32,7 +32,11 @@ def text(pattern: str, words: str) -> Any:
 WORDS = "words"
 """The key of a JSON schema that holds what `text` was given."""
 Name = Annotated[
-    str, text(r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}$", "a name, of up to 64 letters, digits, `_`, `.` and `-`")
+    str,
+    text(
+        r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}$",
+        "a name, of up to 64 letters, digits, `_`, and, not in the first place, `.` and `-`",
+    ),
 ]
 PlainName = Annotated[str, text(r"^[a-z0-9_-]+$", "a name, of small letters, digits, `_` and `-`")]
 

@@ -111,7 +111,8 @@ def _decoded(path: Path, flags: int) -> cv2.typing.MatLike:
     finally:
         logging.setLogLevel(before)
     if image is None:
-        raise DatasetError(f"{path}: {fault}; restore it, or leave its frame out")
+        remedy = "" if "; " in str(fault) else "; restore it, or leave its frame out"
+        raise DatasetError(f"{path}: {fault}{remedy}")
     return image
 
 
