@@ -118,10 +118,16 @@ class PictureDetector:
             image = np.asarray(cv2.resize(image, camera.size, interpolation=cv2.INTER_AREA), np.uint8)
         if self._mounted is None or self._mounted.camera is not camera:  # one object, as rays are cached by it
             self._mounted = RigCamera("camera", camera, RigidTransform(_R_BODY_CAMERA, np.zeros(3)))
-        perception = Perception(Rig({"camera": self._mounted}), self._networks, self._config)
+        config = self._config
         frames = FrameSet(0.0, {"camera": Frame("camera", np.ascontiguousarray(image), 0.0, 0)})
-        trace = DetectionTrace()
-        observation = perception.observe(frames, VehicleState(0.0, np.eye(3), _UNKNOWN_HEIGHT_M), None, trace=trace)
+        while True:
+            trace, perception = DetectionTrace(), Perception(Rig({"camera": self._mounted}), self._networks, config)
+            observation = perception.observe(frames, VehicleState(0.0, np.eye(3), _UNKNOWN_HEIGHT_M), None, trace=trace)
+            most = config.detection.max_proposals
+            if 2 * len(observation.detections) < most or len(trace.proposals) < most:
+                break
+            more = config.detection.model_copy(update={"max_proposals": 2 * most})  # a swarm: as many as it needs
+            config = config.model_copy(update={"detection": more})
         if "camera" not in observation.cameras:  # the networks' output was not finite
             return PictureResult((), 0, np.zeros(image.shape[:2], np.uint8))
         seen, stage = observation.cameras["camera"].labels, self._networks.second_stage

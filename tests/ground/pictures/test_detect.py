@@ -92,6 +92,14 @@ def test_a_field_of_view_reaches_from_border_to_border_and_keeps_a_drones_shape(
     assert np.linalg.norm(down - here) / np.linalg.norm(along - here) < 1.42
 
 
+def test_a_swarm_has_as_many_regions_looked_at_as_it_needs() -> None:
+    """Twenty times the same drone, every other one mirrored; 12 regions are what a picture has at first."""
+    image = np.asarray(cv2.imread(str(RENDERED / "4_m_4.jpg")), np.uint8)[158:318, 84:244, ::-1]
+    row = np.concatenate([image, image[:, ::-1]] * 2 + [image], axis=1)
+    result = PictureDetector().detect(np.ascontiguousarray(np.concatenate([row, row[:, ::-1]] * 2)), fov_deg=90.0)
+    assert 14 <= len(result.detections) <= 20
+
+
 def test_a_known_size_gives_the_range(capsys: Capture) -> None:
     """Twice the size, twice the range; its own deviation (1 cm by default) replaces what the network says of it."""
     (free,) = told_json(capsys, NEAR, *FOV)["pictures"][0]["detections"]
