@@ -2,6 +2,7 @@
 
 PYTHON ?= python3
 SYSTEM ?= debian12
+ARCH ?= arm64
 VENV := .venv
 BIN := $(VENV)/bin
 # ROS 2's wheels start each Python twice, to name their libraries to the loader: an environment of their own.
@@ -11,7 +12,7 @@ LOCK := requirements/service.txt
 COMPILE = $(BIN)/uv pip compile --quiet --no-header --no-annotate --only-binary=:all: pyproject.toml -
 
 .DEFAULT_GOAL := help
-.PHONY: help demo live docs lint test quick test-all browser training coverage ros faults flights breakages mutants references wheel release deb container lock sbom clean
+.PHONY: help demo live docs lint test quick test-all browser training coverage ros faults flights breakages mutants references wheel release deb container install-emulated lock sbom clean
 
 help:
 	@sed -n 's/^\([a-z-]*\):.* ## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 20
@@ -85,6 +86,9 @@ deb: $(BIN)/pip ### build Debian packages for amd64 and arm64 in dist; SYSTEM=de
 
 container: $(BIN)/pip ### build the container, install this computer's package of dist in another, and run both; BASE=IMAGE for another Debian 12
 	$(BIN)/python -m tools.release.check_container --packages dist $(if $(BASE),--base $(BASE))
+
+install-emulated: $(VENV)/test.installed ### as root: install the arm64 package in a new system under emulation, and fly it; SYSTEM=debian13, ARCH=, MIRROR=URL
+	$(BIN)/python -m tools.release.check_emulated --system $(SYSTEM) --arch $(ARCH) $(if $(MIRROR),--mirror $(MIRROR))
 
 lock: $(VENV)/release.installed ### write requirements/service.txt again, with the newest versions that pyproject.toml permits
 	echo setuptools | $(COMPILE) --universal --fork-strategy=fewest --python-version=3.11 --generate-hashes \

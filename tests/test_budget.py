@@ -20,20 +20,20 @@ from flockd.onboard.recording.reader import Recording
 
 ROOT = Path(__file__).parents[1]
 LINES = {
-    "flockd/core": 3_300,
+    "flockd/core": 3_310,
     "flockd/flight": 11_130,
     "flockd/onboard": 9_360,
     "flockd/fleet": 2_730,
-    "flockd/ground": 5_040,
+    "flockd/ground": 5_050,
     "flockd/review": 3_600,
     "flockd/sim": 8_770,
     "flockd/campaign": 1_490,
     "flockd/cli": 3_750,
-    "tests": 39_260,
+    "tests": 39_310,
     "tools/checks": 2_060,
     "tools/docs": 930,
     "tools/measure": 1_520,
-    "tools/release": 550,
+    "tools/release": 700,
     "tools/training": 4_330,
 }
 """Lines of Python below a folder."""
