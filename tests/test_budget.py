@@ -24,20 +24,20 @@ LINES = {
     "flockd/flight": 11_130,
     "flockd/onboard": 9_360,
     "flockd/fleet": 2_730,
-    "flockd/ground": 5_050,
+    "flockd/ground": 5_060,
     "flockd/review": 3_600,
-    "flockd/sim": 8_770,
+    "flockd/sim": 8_890,
     "flockd/campaign": 1_490,
-    "flockd/cli": 3_750,
-    "tests": 39_310,
+    "flockd/cli": 3_770,
+    "tests": 39_370,
     "tools/checks": 2_060,
-    "tools/docs": 930,
+    "tools/docs": 1_000,
     "tools/measure": 1_520,
     "tools/release": 700,
     "tools/training": 4_330,
 }
 """Lines of Python below a folder."""
-FILES = {"flockd": 331}
+FILES = {"flockd": 333}
 NUMBERS_OF_FLIGHT = 270
 """In constants of the modules of `flockd/flight`."""
 SLACK = 0.02
