@@ -215,7 +215,8 @@ def check_rig(config: DroneConfig, folder: Path | None, state_folder: Path = STA
         else:
             fix = f"flockd calibrate rig --from-flight {newest} writes the corrected rig; see that the camera is fixed"
             yield warned(about, f"in the last flight {texts}: {described(one)}", fix)
-    vague = [one.camera for one in found if float(np.diag(one.covariance)[:3].min()) > _VAGUE_TURN_RAD**2]
+    unclear = (one for one in found if float(np.diag(one.covariance)[:3].min()) > _VAGUE_TURN_RAD**2)
+    vague = [one.camera for one in unclear if one not in off]
     for camera in vague if len(vague) < len(found) else ():
         told = f"the last flight, {newest.name}, shows nothing of its mounting, though it shows others'"
         yield warned(f"camera {camera}", told, "look at `flockd cameras --picture`, and fly again")

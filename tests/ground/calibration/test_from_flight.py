@@ -201,6 +201,8 @@ def test_the_doctor_names_a_camera_of_which_the_flight_showed_nothing_though_it_
     assert (left.level, left.about) == (Level.WARNING, "camera left")
     assert rig.level is Level.PASS
     assert rig.measured.endswith("saw 1 cameras as they are configured")
+    (left,) = examined(monkeypatch, drone_config(), tmp_path, seen("front", *right), replace(unseen, elsewhere=True))
+    assert (left.level, left.about) == (Level.FAILURE, "camera left"), "once"
     still = [replace(unseen, camera=name) for name in ("front", "left")]
     (rig,) = examined(monkeypatch, drone_config(), tmp_path, *still)
     assert (rig.level, rig.about) == (Level.PASS, "rig")
