@@ -23,9 +23,6 @@ _HEAD_ON_RAD = 0.1
 _COMES_M_S, _COMES_S = 0.5, 2 * HORIZON_S
 """The drone sidesteps, instead of backing off, a neighbour that approaches at least this fast and would be too near
 within the second number of seconds."""
-_WORTH_M_S = 0.5
-"""The drone changes sides if its velocity there is nearer to the wanted one by this much, for example because the gate
-blocks this side and it could only back off."""
 _RING = 24
 _SPEEDS = 1.0, 0.5
 """Shares of the highest speed that are tried in all directions if no velocity keeps clear of all."""
@@ -85,36 +82,22 @@ class Passing:
         distance_m, max_speed_m_s = self._law.parameters.separation_distance_m, self._law.parameters.max_speed_m_s
         ranges = np.hypot(offsets[:, 0], offsets[:, 1])
         near = np.flatnonzero((np.abs(offsets[:, 2]) < self._vertical_m) & (ranges > SAME_SPOT_M)).tolist()
-        taken = {one: self._sides.get(tracks[one], 0.0) for one in near}
-
-        def plane(one: int, side: float) -> tuple[FloatArray, float, float]:
-            return _half_plane(velocity, offsets[one, :2], velocity - velocities[one], distance_m, side)
-
-        planes = {one: plane(one, taken[one]) for one in near}
-        found = _clearest(wanted, planes.values(), max_speed_m_s, limits)
-        for one in sorted(planes, key=ranges.__getitem__):
-            normal, least_m_s, side = planes[one]
-            if found is not None and side and not taken[one] and normal @ wanted < least_m_s:
-                others = {**planes, one: plane(one, -side)}
-                # Not if the wanted one is clear there: neither would turn, and 150 flights pass nearer (1.6, not
-                # 1.8 m).
-                other = _clearest(wanted, others.values(), max_speed_m_s, limits)
-                if other is not None and (other[0], other[1] + _WORTH_M_S) < found[:2]:
-                    planes, found = others, other
+        sides = {one: self._sides.get(tracks[one], 0.0) for one in near}
+        planes = {
+            one: _half_plane(velocity, offsets[one, :2], velocity - velocities[one], distance_m, side)
+            for one, side in sides.items()
+        }
         self._sides = {tracks[one]: side for one, (_, _, side) in planes.items()}
-        return wanted if found is None else found[2]
+        return _clearest(wanted, planes.values(), max_speed_m_s, limits)
 
 
 def _clearest(
     wanted: FloatArray, planes: Iterable[tuple[FloatArray, float, float]], max_speed_m_s: float, limits: Limits
-) -> tuple[float, float, FloatArray] | None:
-    """(violation m/s, distance from `wanted` m/s, velocity (2,)) of the velocity that violates the half-planes least.
-
-    None: `wanted` violates none.
-    """
+) -> FloatArray:
+    """The velocity (2,) m/s that violates the half-planes least, and of those the nearest to `wanted`."""
     normals, least = np.reshape([one[0] for one in planes], (-1, 2)), np.array([one[1] for one in planes])
     if (normals @ wanted >= least - ROUNDING_M_S).all():
-        return None
+        return wanted
     towards, most_m_s = (one[limits[1] < max_speed_m_s] for one in limits)  # the others do not bind
     across, at_m_s = np.vstack([normals, towards]), np.concatenate([least, most_m_s])
     feet = wanted + (at_m_s - across @ wanted)[:, None] * across
@@ -127,8 +110,8 @@ def _clearest(
     tried = np.vstack([tried, *(np.minimum(max_speed_m_s * share, fastest) * ring for share in _SPEEDS)])
     off = ROUNDING_M_S * np.round(np.maximum(least - tried @ normals.T, 0.0).max(axis=1) / ROUNDING_M_S)
     best = tried[off == off.min()]
-    far = np.linalg.norm(best - wanted, axis=1)
-    return float(off.min()), float(far.min()), best[np.argmin(far)]
+    nearest: FloatArray = best[np.argmin(np.linalg.norm(best - wanted, axis=1))]
+    return nearest
 
 
 def _half_plane(
