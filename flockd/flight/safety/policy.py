@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from enum import IntEnum, StrEnum
+from enum import IntEnum, StrEnum, auto
 
 from flockd.core.config.safety import SafetyParameters
 from flockd.flight.safety.events import Event
@@ -14,27 +14,27 @@ from flockd.flight.safety.events import Event
 class Reaction(IntEnum):
     """The reaction in flight; of several the worst applies."""
 
-    NOTE = 0
+    NOTE = auto()
     """Fly on, and report it."""
-    DEGRADE = 1
+    DEGRADE = auto()
     """Fly on, slower and farther from neighbours."""
-    HOVER = 2
+    HOVER = auto()
     """Stand still; if the event lasts, hold."""
-    HOLD = 3
+    HOLD = auto()
     """Stand still and ask the autopilot to take over: in Hold, to return home, or to land."""
-    RETURN = 4
-    LAND = 5
-    SILENCE = 6
+    RETURN = auto()
+    LAND = auto()
+    SILENCE = auto()
     """Send nothing: the pilot has taken over, or the autopilot's failsafe has to act."""
 
 
 class Barrier(IntEnum):
     """The meaning of an event while flockd does not fly the drone."""
 
-    NONE = 0
-    WAIT = 1
+    NONE = auto()
+    WAIT = auto()
     """Not ready while it lasts."""
-    LATCH = 2
+    LATCH = auto()
     """Not ready until the vehicle was seen disarmed on the ground or an operator asked to resume."""
 
 
