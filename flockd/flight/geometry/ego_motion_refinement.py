@@ -49,12 +49,8 @@ def refine_ego_motion(
     with good depth the translation's length, and all of them its direction. The scale of residuals is estimated from
     the pairs in ``agreeing`` (n,), which agree with ``initial`` in space: more than half of all pairs may be false.
 
-    None: the steps did not converge or the robust cost did not fall. Raises ValueError for pairs of a camera that is
-    not in the rig.
+    None: the steps did not converge or the robust cost did not fall.
     """
-    known = np.isin(pairs.camera_names, list(rig.cameras))
-    if not known.all():
-        raise ValueError(f"pairs of camera {min(pairs.camera_names[~known].tolist())!r}, which is not in the rig")
     agreeing = np.ones(len(pairs), np.bool_) if agreeing is None else agreeing
     if len(pairs) > _MAX_PAIRS:
         drawn = np.sort(np.random.default_rng(seed).choice(len(pairs), _MAX_PAIRS, replace=False))

@@ -6,6 +6,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from scipy import ndimage
 
 from flockd.core.config.avoidance import ObstacleParameters
 from flockd.core.messages import (
@@ -187,13 +188,9 @@ def _body_rays(camera: RigCamera) -> Float32Array:
 
 def _medians(sectors: IntArray, values: Float32Array) -> FloatArray:
     """(SECTORS,) median of each sector's values; 0 without values."""
-    order = np.lexsort((values, sectors))
     count = np.bincount(sectors, minlength=SECTORS)
-    first = np.cumsum(count) - count
-    middle = np.minimum(first + count // 2, max(len(values) - 1, 0))
-    if not len(values):
-        return np.zeros(SECTORS)
-    return np.where(count > 0, values[order][middle], 0.0).astype(float)
+    medians = ndimage.median(values, sectors, np.arange(SECTORS)) if len(values) else 0.0
+    return np.where(count > 0, medians, 0.0).astype(float)
 
 
 def _triangulated(camera: RigCamera, observation: Observation, ego: EgoMotion) -> _Points:

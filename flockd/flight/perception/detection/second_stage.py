@@ -45,12 +45,11 @@ class SecondStage:
                 f"perception.verification: model {judge.name} takes crops of another size than {manifest.name}; "
                 "choose one that takes the same"
             )
-        crop = manifest.crop
-        if crop is None:
-            raise ModelError(f"model {manifest.name} takes no crops; choose one whose manifest has a section `crop`")
+        crop_size = manifest.crop_size_px
+        assert manifest.crop is not None  # or it had no size
         return cls(
-            crop_size=manifest.crop_size_px,
-            rules=crop,
+            crop_size=crop_size,
+            rules=manifest.crop,
             thresholds=Thresholds(
                 drone=judge.threshold("drone_probability"),
                 another_crop=judge.threshold("another_crop_probability"),
