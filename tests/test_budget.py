@@ -21,7 +21,7 @@ from flockd.onboard.recording.reader import Recording
 ROOT = Path(__file__).parents[1]
 LINES = {
     "flockd/core": 3_310,
-    "flockd/flight": 11_130,
+    "flockd/flight": 10_440,
     "flockd/onboard": 9_360,
     "flockd/fleet": 2_730,
     "flockd/ground": 5_060,

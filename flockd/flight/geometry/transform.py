@@ -31,9 +31,9 @@ class RigidTransform:
             raise ValueError(f"a rigid transform is (3, 3) and (3,), not {rotation.shape} and {translation.shape}")
         if not np.isfinite(translation).all():
             raise ValueError("a rigid transform's translation must be finite")
-        if (
-            not (np.abs(rotation @ rotation.T - _EYE) <= _TOLERANCE).all() or np.linalg.det(rotation) < 0.0
-        ):  # NaN fails too
+        is_orthonormal = (np.abs(rotation @ rotation.T - _EYE) <= _TOLERANCE).all()  # NaN is not
+        (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
+        if not is_orthonormal or a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) < 0.0:
             raise ValueError("the matrix is not a rotation: its columns must be orthonormal and right-handed")
         object.__setattr__(self, "rotation", rotation)
         object.__setattr__(self, "translation", translation)
