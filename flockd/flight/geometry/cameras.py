@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
@@ -71,9 +71,8 @@ class Camera(ABC):
         points: FloatArray = self.rays(pixels) * np.asarray(range_m, dtype=np.float64)[:, None]
         return points
 
-    @lru_cache(maxsize=64)  # noqa: B019 - cameras are few, and live as long as the process
     def block_rays(self, stride: int) -> FloatArray:
-        """(h / stride, w / stride, 3) unit vectors along the rays of blocks' centres, NaN as in `rays`; read only."""
+        """(h / stride, w / stride, 3) unit vectors along the rays of the blocks' centres; NaN as in `rays`."""
         width, height = (length // stride for length in self.size)
         middles = np.indices((height, width), np.float64)[::-1].reshape(2, -1).T + 0.5
         return self.rays(np.asarray(stride * middles, np.float64)).reshape(height, width, 3)

@@ -13,7 +13,7 @@ import numpy as np
 from flockd.core.choices import Role
 from flockd.core.config.perception import NO_MODEL, PerceptionConfig
 from flockd.core.errors import ModelError
-from flockd.core.messages import Float32Array, FloatArray, Frame, UInt8Array
+from flockd.core.messages import BoolArray, Float32Array, FloatArray, Frame, UInt8Array
 from flockd.flight.geometry import RigCamera, ZMap
 from flockd.flight.inference.checks import Deadline, no_deadline
 from flockd.flight.inference.fitting import fit
@@ -95,7 +95,7 @@ class OnnxNetworks(OneByOne):
         if self._segmentation is not self._depth:
             maps = self._run(self._segmentation, frame.image, planes)
         logit = self._at_map_stride(maps["drone"], (width, height))[0]
-        logit = np.where(np.isnan(camera.camera.block_rays(self.map_stride)[..., 0]), _NO_DRONE_LOGIT, logit)
+        logit = np.where(_blind(camera, self.map_stride), _NO_DRONE_LOGIT, logit)
         offset = self._at_map_stride(maps["offset"], (width, height))
         # A second stage rejects false proposals, so the first may propose more.
         threshold = self._segmentation.manifest.threshold
@@ -335,3 +335,9 @@ def _ray_tangents(camera: RigCamera, stride: int) -> Float32Array:
     rays = np.nan_to_num(camera.camera.block_rays(stride))  # outside the lens's image
     tangents = rays[..., :2] / np.maximum(rays[..., 2:], _MIN_RAY_Z)
     return np.ascontiguousarray(tangents.transpose(2, 0, 1), dtype=np.float32)
+
+
+@lru_cache(maxsize=32)
+def _blind(camera: RigCamera, stride: int) -> BoolArray:
+    """(h / stride, w / stride) mask of the blocks whose centres the lens does not image."""
+    return np.isnan(camera.camera.block_rays(stride)[..., 0])
