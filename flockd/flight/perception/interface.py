@@ -101,8 +101,6 @@ def outcome(function: Callable[..., T], *arguments: object) -> T | Exception:
 class Flow(Protocol):
     """A method of optical flow: the displacement of each pixel of the first image in the second."""
 
-    name: str
-
     def flow(self, first: UInt8Array, second: UInt8Array) -> Float32Array:
         """(h, w, 3) RGB twice -> (h, w, 2) pixels right and down."""
         ...

@@ -20,7 +20,6 @@ class DisFlow:
 
     def __init__(self, start: Flow | None = None) -> None:
         """``start``: the flow that initialises the coarsest scale; None: no motion."""
-        self.name = f"{start.name}+dis" if start else "dis"
         self._start = start
         self._idle: list[cv2.DISOpticalFlow] = []
         """Instances not in use: none serves two callers at once. Reusing one's memory saves a third of the time."""
@@ -40,7 +39,6 @@ class OnnxFlow:
     """A flow network; scales images as its manifest asks."""
 
     def __init__(self, model: OnnxModel) -> None:
-        self.name = model.manifest.name
         self._model = model
 
     def flow(self, first: UInt8Array, second: UInt8Array) -> Float32Array:

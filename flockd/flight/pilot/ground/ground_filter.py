@@ -62,19 +62,17 @@ class GroundFilter:
         """The ground in this step, and the reason if another source than the configured one is used."""
         if self._source == "barometer":
             return level_ground(vehicle), None
-        ground, reason = self._judged(vehicle)
+        fault = self._follow(vehicle)
+        age_s, ground, reason = vehicle.time_s - self._measured_s, None, None
+        if self._state is not None and (fault is None or age_s <= self._parameters.bridge_s):
+            ground = GroundEstimate(vehicle.height_m - float(self._state[0]), self._state[1:].copy(), "range_finder")
+        elif self._source == "best":
+            ground = level_ground(vehicle)
+            reason = Reason(ReasonKind.HEIGHT, f"height: {fault}; the barometer's is used")
+        else:
+            reason = Reason(ReasonKind.HEIGHT, f"height: {fault}; there is no scale")
         self._used_height_m = 0.0 if ground is None else ground.height_m
         return ground, reason
-
-    def _judged(self, vehicle: VehicleState) -> tuple[GroundEstimate | None, Reason | None]:
-        fault = self._follow(vehicle)
-        age_s = vehicle.time_s - self._measured_s
-        if self._state is not None and (fault is None or age_s <= self._parameters.bridge_s):
-            height_m = vehicle.height_m - float(self._state[0])
-            return GroundEstimate(height_m, self._state[1:].copy(), "range_finder"), None
-        if self._source == "best":
-            return level_ground(vehicle), Reason(ReasonKind.HEIGHT, f"height: {fault}; the barometer's is used")
-        return None, Reason(ReasonKind.HEIGHT, f"height: {fault}; there is no scale")
 
     def see_slope(self, slope: FloatArray) -> None:
         """Takes the slope (2,), north and east, that the images of the newest step show."""
