@@ -129,8 +129,7 @@ def test_what_is_seen_less_well_than_drones_are_takes_longer_to_be_one(
 
 
 def test_what_the_network_doubts_is_not_confirmed_however_often_it_is_detected() -> None:
-    """Its log odds are 0.85 for 20 s, on average; then they go to 4.6, of 0.99, with exp(-t / 5 s): above 2.2, of 0.9,
-    from t = 2.2 s on."""
+    """Log odds of 0.85 for 20 s, then 4.6 - 3.75 exp(-t / 5 s): above 2.2, which are 0.9, from t = 2.2 s on."""
     flock, confirmed = Follower(drone_probability_memory_s=5.0, confirm_probability=0.9), []
     for k in range(60):
         flock.step(replace(_seen(AHEAD), drone_probability=0.7 if k < 40 else 0.99))

@@ -75,16 +75,16 @@ class Detector:
         rules, cascade = stage.rules, Cascade(self._networks, stage, self._parameters, known_size, rig, images)
         proposals = propose_instances(rig, scenes, rules, self._parameters)
         first = cascade.refine(proposals)
-        predicted, unpredicted = propose_predictions(
-            rig, vehicle, predictions, [(c.bearing, c.log_range) for c in first.candidates], rules
-        )
+        sure = stage.thresholds.drone
+        found = [(c.bearing, c.log_range) for c in first.candidates if c.drone_probability >= sure]
+        predicted, unpredicted = propose_predictions(rig, vehicle, predictions, found, rules)
         second = cascade.refine(predicted)
         candidates = [*first.candidates, *second.candidates]
         none = {proposal.instance for proposal in first.rejected if proposal.instance}
         trace.proposals += [*proposals, *predicted]
         trace.candidates += candidates
         reasons = (*unpredicted, *cascade.reasons)
-        return _masked(suppress(candidates, self._parameters), scenes, none, reasons, stage.thresholds.drone)
+        return _masked(suppress(candidates, self._parameters, sure), scenes, none, reasons, sure)
 
 
 def _masked(

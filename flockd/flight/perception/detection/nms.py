@@ -30,8 +30,8 @@ class Suppressed:
         return {instance: label for (name, instance), label in self.label_of.items() if name == camera}
 
 
-def suppress(candidates: Sequence[Candidate], parameters: DetectionParameters) -> Suppressed:
-    """The detections: all candidates of one drone are fused.
+def suppress(candidates: Sequence[Candidate], parameters: DetectionParameters, sure: float = 0.0) -> Suppressed:
+    """The detections: all candidates of one drone are fused, or those of at least the probability ``sure`` if any is.
 
     Greedy, as usual: the candidate of the largest instance is compared first.
     """
@@ -44,7 +44,7 @@ def suppress(candidates: Sequence[Candidate], parameters: DetectionParameters) -
             group.append(one)
     detections, label_of = [], {}
     for label, group in enumerate(groups[:MAX_DETECTIONS], start=1):
-        detections.append(fuse(group, label))
+        detections.append(fuse([one for one in group if one.drone_probability >= sure] or group, label))
         for one in group:
             if one.proposal.instance:
                 label_of[(one.proposal.cameras[0], one.proposal.instance.label)] = label

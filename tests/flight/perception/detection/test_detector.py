@@ -36,11 +36,9 @@ class Scene:
         return found.detections, found.masks[self.camera]
 
 
-@pytest.mark.parametrize(
-    ("probability", "detections", "label"), [(0.05, 0, 0), (0.35, 0, 255), (0.6, 1, 255), (0.9, 1, 1)]
-)
-def test_what_is_no_drone_belongs_to_the_background_again(probability: float, detections: int, label: int) -> None:
-    """The tracker is told of what is likelier a drone than not; the pixels are only a sure drone's."""
+@pytest.mark.parametrize(("probability", "count", "label"), [(0.05, 0, 0), (0.35, 0, 255), (0.6, 1, 255), (0.9, 1, 1)])
+def test_what_is_no_drone_belongs_to_the_background_again(probability: float, count: int, label: int) -> None:
+    """Detected is what is likelier a drone than not; pixels are only a sure drone's."""
     flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (3.0, 0.0, -4.0)))
     scene = Scene(flyer)
     estimates = flyer.truth.sound("ranges")
@@ -48,7 +46,7 @@ def test_what_is_no_drone_belongs_to_the_background_again(probability: float, de
         replace(e, drone_probability=probability) for e in estimates(crops)
     )
     found, labels = scene.detect()
-    assert [one.drone_probability for one in found] == detections * [probability]
+    assert [one.drone_probability for one in found] == count * [probability]
     assert set(labels[scene.maps.labels > 0]) == {label}
 
 

@@ -159,6 +159,13 @@ def candidate(
     return Candidate(proposal, bearing, log_range, sigma, 0.004, size_m, 0.9)
 
 
+@pytest.mark.parametrize(("sure", "range_m"), [(0.95, 4.0), (0.99, math.sqrt(4.0 * 4.2)), (0.5, math.sqrt(4.0 * 4.2))])
+def test_a_doubtful_candidate_does_not_move_a_sure_one(sure: float, range_m: float) -> None:
+    """Of 0.97 at 4 m and 0.9 at 4.2 m, equally vague: alone, or their mean where both are sure or none is."""
+    both = [replace(candidate(4.0, 0.05), drone_probability=0.97), candidate(4.2, 0.05, camera="left")]
+    assert [one.range_m for one in suppress(both, PARAMETERS, sure).detections] == [pytest.approx(range_m)]
+
+
 @pytest.mark.parametrize(
     ("range_m", "turned_deg", "sigma", "same"),
     [
