@@ -17,6 +17,13 @@ _SUREST = 0.999
 """A network is taken for no surer than this."""
 
 
+def begun(drone_probability: float, parameters: TrackingParameters) -> float:
+    """Of a new track from one detection: clutter is as much denser among doubtful detections as their odds are lower
+    than those that confirm a track."""
+    doubt = _log_odds(drone_probability) - _log_odds(parameters.confirm_probability)
+    return _bayes(parameters.birth_probability, min(doubt, 0.0))
+
+
 def missed(probability: float, in_view: float, weight: float, parameters: TrackingParameters) -> float:
     """After a frame set without a detection of the track, which the cameras show with the probability `in_view`."""
     return _bayes(probability, weight * math.log(1.0 - in_view * parameters.detection_probability))

@@ -233,7 +233,7 @@ class Tracker:
         self._created += 1
         return _Track(
             number=self._created,
-            existence=self.parameters.birth_probability,
+            existence=existence.begun(measurement.drone_probability, self.parameters),
             drone_probability=measurement.drone_probability,
             first_seen_s=self._time_s,
             last_seen_s=self._time_s,

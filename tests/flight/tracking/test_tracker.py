@@ -139,6 +139,13 @@ def test_what_the_network_doubts_is_not_confirmed_however_often_it_is_detected()
     assert all(confirmed[first:])
 
 
+@pytest.mark.parametrize(("probability", "existence"), [(1.0, 0.5), (0.95, 0.5), (0.8, 0.25), (0.75, 0.2)])
+def test_a_doubtful_detection_begins_a_less_likely_track(probability: float, existence: float) -> None:
+    """By hand: 12 to 1 confirms; 4 to 1 is a third of that, 3 to 1 a quarter, and so are the odds of existence."""
+    flock = Follower(confirm_probability=12 / 13).steps(1, replace(_seen(AHEAD), drone_probability=probability))
+    assert flock.one.existence_probability == pytest.approx(existence * probability)
+
+
 def test_existence_after_a_miss_is_bayes_rule() -> None:
     """By hand: P_D = 0.75, survival 0.5 s of 10 s: p = e^-0.05; missed: p / 4 / (1 - p + p / 4)."""
     flock = Follower(detection_probability=0.75, survival_time_s=10.0).steps(20, AHEAD).steps(1)
