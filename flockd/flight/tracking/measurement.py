@@ -9,6 +9,7 @@ from typing import Self
 import numpy as np
 
 from flockd.core.messages import Detection, FloatArray
+from flockd.flight.geometry import log_polar, log_polar_covariance
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +58,25 @@ class Measurement:
             drone_probability=detection.drone_probability,
             log_size_sigma=detection.log_size_sigma,
         )
+
+    @classmethod
+    def of_position(
+        cls,
+        position: FloatArray,
+        *,
+        range_sigma_m: float,
+        bearing_sigma_rad: float,
+        size_m: float,
+        drone_probability: float = 1.0,
+    ) -> Self:
+        """A position (3,) in metres, NED, own drone at the origin, with independent errors of range and bearing.
+
+        `bearing_sigma_rad` is the standard deviation across the line of sight, in each direction. Raises ValueError for
+        the origin too.
+        """
+        bearing, log_range = log_polar(position)
+        covariance = log_polar_covariance(bearing, range_sigma_m / math.exp(log_range), bearing_sigma_rad)
+        return cls(bearing, log_range, covariance, size_m, drone_probability)
 
     @property
     def range_m(self) -> float:
