@@ -17,6 +17,7 @@ from flockd.onboard.telemetry.topics import PREFIX, AboutMessage, AnswerMessage,
 
 ANSWER_S = 3.0
 PICTURE_S = 1.5
+AGAIN_S = 0.1
 MAX_REPLY_BYTES = 1 << 16
 """Ten times a drone's configuration, and twice a small picture."""
 MAX_PICTURE_PX = 1024
@@ -48,25 +49,28 @@ class DroneQueries:
     def ask(
         self, drone: str, identity: str, command: str, operator: str, order: Mapping[str, object] | None = None
     ) -> AnswerMessage | None:
-        """The answer to an operator's command. ``identity``: that of its liveliness token."""
-        for session in dict.fromkeys((self._orders, self._session)):  # one may not be connected yet
-            now: TimeMessage | None = self.message(f"{drone}/time", TimeMessage, session=session)
-            if now is None:
-                continue
-            ask = AskMessage(
-                identity=identity,
-                operator=operator,
-                session=self._name,
-                sequence=next(self._numbers),
-                time_s=now["time_s"],
-                order=None if order is None else {**order},
-            )
-            payload = json.dumps(ask, allow_nan=False).encode()
-            answer: AnswerMessage | None = self.message(
-                f"{drone}/ask/{command}", AnswerMessage, payload, session=session
-            )
-            return answer
-        return None
+        """The answer to an operator's command. ``identity``: that of its liveliness token.
+
+        The drone's clock is asked first, again and again: a connection that has just been made does not know yet what
+        the drone replies to. The command itself is sent once.
+        """
+        until_s, session = time.monotonic() + ANSWER_S, self._orders
+        while (now := self.message(f"{drone}/time", TimeMessage, session=session)) is None:
+            if time.monotonic() >= until_s:
+                return None
+            session = self._session if session is self._orders else self._orders  # one may not be connected yet
+            time.sleep(AGAIN_S)
+        ask = AskMessage(
+            identity=identity,
+            operator=operator,
+            session=self._name,
+            sequence=next(self._numbers),
+            time_s=now["time_s"],
+            order=None if order is None else {**order},
+        )
+        payload = json.dumps(ask, allow_nan=False).encode()
+        answer: AnswerMessage | None = self.message(f"{drone}/ask/{command}", AnswerMessage, payload, session=session)
+        return answer
 
     def about(self, drone: str) -> AboutMessage | None:
         """The drone's configuration."""
