@@ -72,7 +72,7 @@ def test_without_a_fence_nothing_is_outside_not_even_the_unknown() -> None:
 def test_where_the_drone_is_not_known_it_counts_as_outside_but_in_no_direction(limits: GateParameters) -> None:
     for position in ([math.nan, math.nan], [0.0, math.nan], [math.inf, 0.0]):
         assert outside_fence(limits, np.array(position))
-        assert towards_fence(limits, np.array(position))[0].shape == (0, 2)
+        assert [part.shape for part in towards_fence(limits, np.array(position))] == [(0, 2), (0,)]
 
 
 @pytest.mark.parametrize("corners", [SQUARE, L_SHAPE, L_SHAPE[::-1]])
