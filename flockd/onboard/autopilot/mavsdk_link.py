@@ -314,13 +314,13 @@ class AutopilotLink:
                 asked_s = self._clock()
                 with suppress(AutopilotError):
                     await self.ask_for_checks()
-            if self._clock() - version_s >= VERSION_AGAIN_S:
-                version_s = self._clock()
-                with suppress(AutopilotError):
-                    await self._command("for its version", COMMAND_REQUEST_MESSAGE, 148)
             if self._beginnings() != beginnings:
                 beginnings = self._beginnings()
                 await self._request_streams()
+            elif self._clock() - version_s >= VERSION_AGAIN_S:
+                version_s = self._clock()
+                with suppress(AutopilotError):
+                    await self._command("for its version", COMMAND_REQUEST_MESSAGE, 148)
             await asyncio.sleep(ATTEND_S)
 
     def _beginnings(self) -> int:
