@@ -15,7 +15,7 @@ from flockd.flight.inference.manifest_file import ManifestFile
 _GOLDEN_TOLERANCE = 0.02
 """Largest difference of mean and deviation: providers round differently."""
 _ROUNDED_TOLERANCE = 0.05
-"""The same for a network in 8 bits on another provider than the first it is made for: they round between layers."""
+"""The same for a network in 8 bits on another provider than the first in its manifest, as layers round differently."""
 
 Deadline = Callable[[Callable[[], None], Callable[[], None]], None]
 """Runs the first function; if it takes too long, calls the second, which stops it, and raises TimeoutError.
@@ -30,7 +30,7 @@ def no_deadline(work: Callable[[], None], stop: Callable[[], None]) -> None:
 
 
 class Tensor(Protocol):
-    """An input or an output, as ONNX Runtime describes it."""
+    """An input or an output as ONNX Runtime describes it."""
 
     name: str
     type: str
@@ -38,13 +38,13 @@ class Tensor(Protocol):
 
 
 def check_tensors(file: ManifestFile, inputs: Sequence[Tensor], outputs: Sequence[Tensor]) -> None:
-    """Raises ModelError when the ONNX file's inputs and outputs are not those of the manifest."""
+    """Raises ModelError if the ONNX file's inputs and outputs differ from the manifest's."""
     for fault in _misfits(file.manifest, {t.name: t for t in inputs}, {t.name: t for t in outputs}):
         raise file.error(fault.key, f"{fault.message}; make them agree")
 
 
 def _misfits(manifest: Manifest, inputs: Mapping[str, Tensor], outputs: Mapping[str, Tensor]) -> Iterator[Fault]:
-    # Every input has to be fed; some outputs may be unused.
+    # The model needs every input; outputs may be unused.
     for key, wanted, found, fits in (
         ("inputs", manifest.inputs, inputs, set(manifest.inputs) == set(inputs)),
         ("outputs", manifest.outputs, outputs, set(manifest.outputs) <= set(outputs)),
@@ -59,7 +59,8 @@ def _misfits(manifest: Manifest, inputs: Mapping[str, Tensor], outputs: Mapping[
 
 
 def _misfit(spec: InputSpec | OutputSpec, type_: str, shape: Sequence[int | str | None]) -> Fault | None:
-    """The difference between a manifest's and a model file's tensor. The manifest may fix what is free in the file."""
+    """The difference between a manifest's and a model file's tensor. The manifest may fix a size that the file leaves
+    free."""
     of_file = {"tensor(float)": "float32"}.get(type_, type_.removeprefix("tensor(").removesuffix(")"))
     if of_file != spec.dtype:
         return Fault(("dtype",), f"the manifest says {spec.dtype} but the model file {of_file}")
@@ -75,7 +76,7 @@ def _misfit(spec: InputSpec | OutputSpec, type_: str, shape: Sequence[int | str 
 
 
 def check_golden(file: ManifestFile, provider: Provider, outputs: Mapping[str, NDArray[Any]]) -> None:
-    """Raises ModelError when the outputs for the golden input are not the manifest's."""
+    """Raises ModelError if mean or deviation of an output for the golden input differs from the manifest's."""
     made_for = file.manifest.providers
     tolerance = _GOLDEN_TOLERANCE if not made_for or made_for[0] == provider else _ROUNDED_TOLERANCE
     for name, spec in file.manifest.outputs.items():

@@ -1,4 +1,4 @@
-"""Inputs for a model without real images: the golden input, and empty inputs of a camera's size."""
+"""Inputs for a model without real images: the golden input, and inputs of a camera's size."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from flockd.flight.inference.fitting import Size, entering, fit
 from flockd.flight.inference.manifest import Manifest
 
 Feeds = dict[str, NDArray[Any]]
-"""By input."""
+"""Arrays by the names of a model's inputs."""
 
 
 def golden_image(size: Size, seed: int = 0) -> UInt8Array:
@@ -30,7 +30,7 @@ def golden_feeds(manifest: Manifest) -> Feeds:
 
 
 def feeds_for(manifest: Manifest, image: Size, batch: int = 1) -> Feeds:
-    """Empty inputs for images of a camera, or for a batch of crops."""
+    """Inputs for an image of this size, width and height, or for a batch of crops; their content does not matter."""
     fitting = fit(manifest, image)
     if manifest.crop is None:
         return _feeds(manifest, fitting.full, lambda _: [fitting.enter(golden_image(image))])
@@ -44,7 +44,7 @@ def shapes_of(feeds: Mapping[str, NDArray[Any]]) -> dict[str, list[int]]:
 
 
 def _feeds(manifest: Manifest, size: Size, images: Callable[[int], Sequence[UInt8Array]]) -> Feeds:
-    """The images of the input of each number, and planes of an input image of this size."""
+    """Feeds for input images of ``size``; ``images`` gives the images for the number of an input. Planes are zero."""
     feeds: Feeds = {}
     for number, (name, spec) in enumerate(manifest.inputs.items()):
         if spec.kind == "image":
@@ -52,6 +52,6 @@ def _feeds(manifest: Manifest, size: Size, images: Callable[[int], Sequence[UInt
             continue
         planes, stride = spec.shape[1], manifest.map_stride
         assert isinstance(planes, int)
-        assert stride is not None  # a manifest with planes has both
+        assert stride is not None  # `Manifest.faults` requires both for planes
         feeds[name] = np.zeros((1, planes, size[1] // stride, size[0] // stride), spec.dtype)
     return feeds

@@ -19,7 +19,7 @@ Size = tuple[int, int]
 
 @dataclass(frozen=True)
 class Fitting:
-    """An image resized to ``inner`` at the top left of the ``full`` input; its borders fill what is left."""
+    """An image resized to ``inner`` at the top left of the ``full`` input; its border pixels fill the rest."""
 
     image: Size
     inner: Size
@@ -31,7 +31,7 @@ class Fitting:
         return self.inner[0] / self.image[0], self.inner[1] / self.image[1]
 
     def enter(self, image: UInt8Array) -> UInt8Array:
-        """(h, w, 3) of the image's size -> of the input's."""
+        """Resizes and pads an image (h, w, 3) to the size of the input."""
         if self.inner != self.image:
             shrinks = self.inner[0] <= self.image[0]
             how = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
@@ -42,7 +42,7 @@ class Fitting:
         return np.asarray(cv2.copyMakeBorder(image, 0, down, 0, right, cv2.BORDER_REPLICATE), dtype=np.uint8)
 
     def enter_planes(self, planes: Float32Array, stride: int) -> Float32Array:
-        """(c, h/stride, w/stride) of the image -> the same of the input."""
+        """Resizes and pads planes (c, h / stride, w / stride) of an image to the size of the input."""
         width, height = self.inner[0] // stride, self.inner[1] // stride
         if planes.shape[1:] != (height, width):
             resized = [cv2.resize(plane, (width, height), interpolation=cv2.INTER_LINEAR) for plane in planes]
@@ -53,13 +53,13 @@ class Fitting:
         return np.array([cv2.copyMakeBorder(plane, 0, down, 0, right, cv2.BORDER_REPLICATE) for plane in planes])
 
     def inside(self, map_: Float32Array) -> Float32Array:
-        """The part of a map (..., h, w) of the whole input, at any resolution, that shows the image."""
+        """Crops a map (..., h, w) of the whole input, at any resolution, to the image."""
         height, width = map_.shape[-2:]
         return map_[..., : round(height * self.inner[1] / self.full[1]), : round(width * self.inner[0] / self.full[0])]
 
 
 def fit(manifest: Manifest, image: Size) -> Fitting:
-    """How images of this size enter a model."""
+    """The resizing and padding of images of this size, width and height, for a model."""
     fixed = manifest.fixed_size
     if fixed is not None:
         scale = min(fixed[0] / image[0], fixed[1] / image[1])
@@ -71,7 +71,7 @@ def fit(manifest: Manifest, image: Size) -> Fitting:
 
 
 def entering(spec: InputSpec, images: Sequence[UInt8Array]) -> NDArray[Any]:
-    """RGB images (h, w, 3) of the input's size as the batch that it takes."""
+    """Converts RGB images (h, w, 3) of the input's size to its batch, in its colour, layout and scale."""
     if spec.colour == "bgr":
         images = [image[..., ::-1] for image in images]
     elif spec.colour == "grey":
@@ -89,7 +89,7 @@ def entering(spec: InputSpec, images: Sequence[UInt8Array]) -> NDArray[Any]:
 
 
 def leaving(spec: OutputSpec, output: NDArray[Any]) -> Float32Array:
-    """An output in its unit, float32; a map as (n, c, h, w)."""
+    """Converts an output to float32 in its unit; maps to (n, c, h, w)."""
     values = np.asarray(output, dtype=np.float32)
     if values.ndim == 3:
         values = values[:, None]

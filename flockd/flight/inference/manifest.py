@@ -29,7 +29,7 @@ class Fault:
 
 
 class TensorSpec(Section):
-    """One input or output of the network. A number in its shape is fixed, a word is free."""
+    """One input or output of the network. A number in its shape is a fixed size, a word a free one."""
 
     shape: tuple[int | str, ...]
     meaning: Annotated[str, Field(min_length=1)]
@@ -41,9 +41,9 @@ class InputSpec(TensorSpec):
 
     dtype: Literal["uint8", "float32", "float16"]
     carries: str | None = None
-    """Meaning of the input; by default its name."""
+    """Name of the input's content, such as `image`; by default the input's name."""
     kind: Literal["image", "planes"] = "image"
-    """`planes` are (n, c, h, w) numbers that are fed as they are, at `map_stride` image pixels a number."""
+    """`planes` are numbers (n, c, h, w) that are not converted, one for `map_stride` pixels of the image."""
     layout: Literal["nhwc", "nchw"] = "nhwc"
     colour: Literal["rgb", "bgr", "grey"] = "rgb"
     white: Positive = 255.0
@@ -86,7 +86,7 @@ class DepthMeaning(Section):
 
     quantity: Literal["depth", "inverse_depth"] = "depth"
     unknown: Unknown = "nothing"
-    """What the network cannot know. `perception.scale` then has to be `height`, which fixes it."""
+    """What the network leaves undetermined. `perception.scale` must then be `height`, which determines it."""
     focal_px: Positive | None = None
     """Focal length in pixels of the input for which depth is metric; for other cameras it is scaled."""
 
@@ -96,7 +96,7 @@ class OutputSpec(TensorSpec):
 
     dtype: Literal["float32", "float16"]
     gives: str | None = None
-    """Meaning of the output; by default its name."""
+    """Name of the output's content, such as `flow`; by default the output's name."""
     layout: Literal["nhwc", "nchw"] = "nchw"
     """Layout of a map with 4 axes; with 3 it is (n, h, w)."""
     columns: tuple[Annotated[str, Field(min_length=1)], ...] = ()
@@ -110,7 +110,7 @@ class OutputSpec(TensorSpec):
     def by_column(self, values: Float32Array) -> dict[str, Float32Array]:
         """The columns (n,) of an output (n, k), by their names. Raises ValueError for an output of another shape."""
         if values.ndim != 2 or values.shape[1] != len(self.columns):
-            raise ValueError(f"an output of shape {values.shape} has not the columns {', '.join(self.columns)}")
+            raise ValueError(f"an output of shape {values.shape} does not have the columns {', '.join(self.columns)}")
         return {name: values[:, index] for index, name in enumerate(self.columns)}
 
     def faults(self) -> Iterator[Fault]:
@@ -125,36 +125,36 @@ class OutputSpec(TensorSpec):
 
 
 class CropSpec(Section):
-    """How to cut a crop for a model: a square with the object in the middle, at a certain size.
+    """How to cut a crop for a model: a square around the object, of a width that follows from the object's size.
 
-    The same numbers serve lenses of any kind and length: the greatest width is an angle, the least is in pixels of the
-    camera's image, whose sharpness it is about.
+    The numbers hold for every lens: the largest width is an angle. The smallest is in pixels of the camera's image, as
+    its resolution limits it.
     """
 
     fill: Positive
-    """Half of a crop's width over the object's size, both at the object's range; for an object of known size."""
+    """For an object of known size: half the width of a crop over the object's size, both at the object's range."""
     first_margin: Positive
-    """Half of the first crop's width, over the distance from the centre of the object's box to its farthest corner."""
+    """Half the width of the first crop over the distance from the centre of the object's box to its farthest corner."""
     cut_margin: Positive
     """The same if the image's border cuts the box: the object is larger than its visible part."""
     mirror_scale: Positive
-    """Width of the last crop, over the width that fits the object. It is mirrored: the model's errors then differ, and
-    the mean of both is better."""
+    """Width of the last crop over the width that fits the object. The last crop is mirrored: the model's errors differ
+    between the two, so their mean is better."""
     min_half_width_px: Positive
     """Half of a crop's width is at least this, in pixels of the camera's image: smaller objects stay small in it."""
     max_half_angle_deg: Annotated[float, Field(gt=0, lt=90)]
     """Largest half width, as an angle seen from the camera."""
     max_resize: Annotated[float, Field(gt=1)]
-    """A further crop is at most this many times as wide as the one before it, and at least as much narrower."""
+    """Largest factor by which the width changes from one crop to the next, wider or narrower."""
     max_crops: Annotated[int, Field(ge=2)]
     """Largest number of crops before the mirrored one: the first and the refined ones."""
 
     def fitting(self, size_m: FloatArray, range_m: FloatArray) -> FloatArray:
-        """(n,) half angles of crops, rad, that fit objects of known size and range (n,)."""
+        """(n,) rad: half angles of the crops that fit objects of sizes and ranges (n,) m."""
         return np.asarray(np.arctan(self.fill * size_m / range_m))
 
     def bounded(self, half_angle: FloatArray, pixel_angle: FloatArray) -> FloatArray:
-        """(n,) rad, within the bounds. ``pixel_angle`` (n,): rad of a pixel of the image there."""
+        """(n,) rad: half angles (n,) within the bounds. ``pixel_angle`` (n,): rad that a pixel of the image spans."""
         least = np.maximum(half_angle, self.min_half_width_px * pixel_angle)
         return np.minimum(least, np.radians(self.max_half_angle_deg))
 
@@ -164,20 +164,20 @@ class Manifest(Section):
 
     name: PlainName
     roles: Annotated[tuple[str, ...], Field(min_length=1)]
-    """Roles that it can fill; the user of a role defines its requirements."""
+    """Roles that it can fill; the code that uses a role defines its requirements."""
     file: Annotated[str, Field(min_length=1)]
     sha256: Annotated[str, text(r"^[0-9a-f]{64}$", "a SHA-256, 64 hexadecimal digits in small letters")]
     description: str
     image_scale: Positive = 1.0
-    """The images are resized by this factor. A model of fixed size takes them as large as they fit."""
+    """Factor by which images are resized. For an input of fixed size they are resized to the largest that fits."""
     least_side_px: Annotated[int, Field(ge=0)] = 0
-    """The shorter side keeps at least so many pixels, if the image has them."""
+    """Least length of the shorter side after resizing; a smaller image is not resized."""
     size_multiple: Annotated[int, Field(ge=1)] = 1
     """The input's height and width are padded to a multiple of this."""
     map_stride: Annotated[int, Field(ge=1, le=64)] | None = None
     """Pixels of the input image per number of its planes, and per pixel of the output maps."""
     crop: CropSpec | None = None
-    """How input crops are cut; None: the input are whole images."""
+    """How input crops are cut; None: the inputs are whole images."""
     thresholds: dict[str, float] = Field(default_factory=dict)
     """Decision thresholds of this model's outputs, by name; they belong to the weights."""
     inputs: Annotated[dict[str, InputSpec], Field(min_length=1)]
@@ -185,7 +185,7 @@ class Manifest(Section):
     golden_size: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]]
     """Width and height of the golden input image."""
     providers: tuple[Provider, ...] = ()
-    """The providers that it was made for; empty: any."""
+    """Providers that it was made for; empty: all."""
     licence: str
     data: str
     accuracy: dict[str, str]
@@ -194,35 +194,35 @@ class Manifest(Section):
 
     @property
     def contents(self) -> Mapping[str, InputSpec]:
-        """The inputs by what they carry."""
+        """The inputs by their content."""
         return {spec.carries or name: spec for name, spec in self.inputs.items()}
 
     @property
     def results(self) -> Mapping[str, OutputSpec]:
-        """The outputs by what they give."""
+        """The outputs by their content."""
         return {spec.gives or name: spec for name, spec in self.outputs.items()}
 
     @property
     def fixed_size(self) -> tuple[int, int] | None:
-        """Width and height of the images that enter, if the model takes no other."""
+        """Width and height of the input images; None: the model takes any size."""
         width, height = next(spec.image_size for spec in self.inputs.values() if spec.kind == "image")
         return (width, height) if isinstance(width, int) and isinstance(height, int) else None
 
     @property
     def crop_size_px(self) -> int:
-        """Width and height of the crop that enters. Raises ModelError where whole images enter."""
+        """Width and height of the input crops. Raises ModelError if the inputs are whole images."""
         if self.crop is None or self.fixed_size is None:
             raise ModelError(f"model {self.name} takes no crops; choose one whose manifest has a section `crop`")
         return self.fixed_size[0]
 
     def threshold(self, name: str) -> float:
-        """One number by which the outputs are judged. Raises ModelError where the manifest has none of that name."""
+        """A decision threshold of the outputs. Raises ModelError if the manifest has none of that name."""
         if name not in self.thresholds:
             raise ModelError(f"model {self.name} has no thresholds.{name}; add it to its manifest")
         return self.thresholds[name]
 
     def faults(self) -> Iterator[Fault]:
-        """What does not fit together, whatever the model is used for."""
+        """Contradictions within the manifest, whatever the model is used for."""
         yield from _located(("inputs",), self.inputs)
         yield from _located(("outputs",), self.outputs)
         images = [spec for spec in self.inputs.values() if spec.kind == "image"]

@@ -19,14 +19,14 @@ from flockd.core.errors import ConfigError, ConfigProblem, ModelError, shortage_
 from flockd.flight.inference.manifest import Fault, Key, Manifest
 
 Check = Callable[[Manifest], Iterable[Fault]]
-"""What is wrong with a manifest, for a caller that uses the model."""
+"""Returns a manifest's faults for one use of the model."""
 MAX_MODEL_BYTES = 2 << 30
-"""A protobuf, and so an ONNX file without weights outside it, cannot be larger."""
+"""Largest protobuf, and so the largest ONNX file without external weights."""
 
 
 @dataclass(frozen=True)
 class ManifestFile:
-    """A manifest that has been read, with the place of each of its keys, for errors found later."""
+    """A manifest, with the line of each of its keys for errors found later."""
 
     path: Path
     manifest: Manifest
@@ -38,14 +38,14 @@ class ManifestFile:
         return self.path.parent / self.manifest.file
 
     def error(self, key: Key, message: str) -> ModelError:
-        """The error that something is wrong at a key, or at the section that lacks it: file, line, key, and what."""
+        """An error with file, line, key and message; the line of a missing key is that of its section."""
         section = key
         while section not in self.places:
             section = section[:-1]
         return ModelError(str(ConfigProblem(str(self.path), self.places[section].line, key_text(key), message)))
 
     def check_model(self) -> None:
-        """Raises ModelError where the ONNX file is missing or differs from the manifest's SHA-256."""
+        """Raises ModelError if the ONNX file is missing or differs from the manifest's SHA-256."""
         model, wanted = self.model, self.manifest.sha256
         try:
             if model.exists() and not model.is_file():
@@ -68,7 +68,7 @@ class ManifestFile:
 
 
 def nothing_more(manifest: Manifest) -> Iterable[Fault]:
-    """The check for a caller that only describes a model."""
+    """A check that accepts every manifest, for a caller that only describes the model."""
     return ()
 
 
@@ -101,9 +101,9 @@ def load_manifest(path: Path, check: Check = nothing_more) -> tuple[Manifest, Pa
 
 
 def models_folder(config: PerceptionConfig) -> Path:
-    """Where a configuration's models are known by their names: its own folder, else the one that comes with flockd.
+    """The folder of a configuration's models: `perception.models_dir`, else the folder that comes with flockd.
 
-    Raises ModelError when its own is not there.
+    Raises ModelError if `perception.models_dir` does not exist.
     """
     if config.models_dir is None:
         return data_path("models")
@@ -114,7 +114,7 @@ def models_folder(config: PerceptionConfig) -> Path:
 
 
 def manifest_path(folder: Path, name: str) -> Path:
-    """The path of the manifest of a model named in a folder, or named by its manifest's path."""
+    """The path of a model's manifest; ``name`` is a name in the folder, or the path itself, which ends in `.yaml`."""
     return Path(name) if name.endswith(".yaml") else folder / f"{name}.yaml"
 
 
@@ -125,14 +125,14 @@ def manifests_of(config: PerceptionConfig) -> tuple[Path, ...]:
 
 
 def models_for(role: Role, folder: Path) -> tuple[str, ...]:
-    """Names of the models in a folder that fill a role, and what may stand in place of one, for people."""
+    """Names in a folder of models that fill a role, and the words that may replace a model, for people."""
     found = []
     for path in find_manifests(folder):
         try:
             if role in read_manifest(path).manifest.roles:
                 found.append(path.stem)
         except ModelError:
-            continue  # whoever names it is told why it cannot be read
+            continue  # a command that names this model reports the error
     return (*found, *_WITHOUT_MODEL.get(role, ()))
 
 
@@ -147,6 +147,6 @@ def find_manifests(folder: Path) -> tuple[Path, ...]:
 
 
 def model_hashes(perception: PerceptionConfig) -> dict[str, str]:
-    """SHA-256 of each model that a configuration uses, by the name in its manifest. Raises ModelError."""
+    """SHA-256 of each model that a configuration uses, by its manifest's `name`. Raises ModelError."""
     manifests = [load_manifest(path)[0] for path in sorted(manifests_of(perception))]
     return {manifest.name: manifest.sha256 for manifest in manifests}

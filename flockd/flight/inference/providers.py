@@ -1,4 +1,4 @@
-"""What computes the networks: ONNX Runtime's execution providers or OpenVINO, and what they build ahead of flight."""
+"""Providers that compute networks, ONNX Runtime's or OpenVINO, and the engines that they build before a flight."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ EXECUTION_PROVIDERS: dict[Provider, str] = {
     "cuda": "CUDAExecutionProvider",
     "tensorrt": "TensorrtExecutionProvider",
 }
-"""OpenVINO computes by itself: ONNX Runtime's provider for it runs only some of the networks."""
+"""OpenVINO is used without ONNX Runtime, whose provider for it runs only some of the networks."""
 BUILD_ENGINES: frozenset[Provider] = frozenset({"tensorrt", "openvino"})
-"""These build an engine for a model ahead of flight and can keep it."""
+"""Providers that build an engine for a model and can keep it."""
 SLOW_TO_BUILD: frozenset[Provider] = frozenset({"tensorrt"})
-"""These take minutes for one, and for each new shape of input another: never in flight."""
+"""Providers that take minutes for an engine, and build another for each new shape of input: never in flight."""
 _STAMP = "shapes.json"
 
 Shapes = Mapping[str, Sequence[int]]
-"""By input."""
+"""Shapes by the names of a model's inputs."""
 
 
 def engines_folder(config: PerceptionConfig) -> Path:
-    """Where a configuration's engines are kept."""
+    """The folder of a configuration's engines."""
     return Path(config.engines_dir) if config.engines_dir else models_folder(config) / "engines"
 
 
 def engine_folder(engines: Path | None, provider: Provider, name: str, sha256: str) -> Path | None:
-    """Where the engines of one model are, for one provider and this version of its library; None: it keeps none."""
+    """The folder of a model's engines for one provider and this version of its library; None: it keeps no engines."""
     if engines is None or provider not in BUILD_ENGINES:
         return None
     version = importlib.metadata.version("openvino") if provider == "openvino" else ort.__version__
@@ -48,25 +48,25 @@ def engine_folder(engines: Path | None, provider: Provider, name: str, sha256: s
 
 
 def available() -> tuple[Provider, ...]:
-    """What the libraries that are installed can compute with."""
+    """Providers of the installed libraries."""
     found = ort.get_available_providers()
     of_onnx_runtime = tuple(provider for provider, name in EXECUTION_PROVIDERS.items() if name in found)
     return (*of_onnx_runtime, "openvino") if importlib.util.find_spec("openvino") else of_onnx_runtime
 
 
 def provider_of(manifest: Manifest, wanted: Provider) -> Provider:
-    """What computes a model where ``wanted`` is configured: OpenVINO leaves crops to ONNX Runtime on the processor.
+    """The provider that computes a model if ``wanted`` is configured.
 
-    They come in batches of any size, which ONNX Runtime computes faster.
+    Instead of OpenVINO, ONNX Runtime on the CPU computes models for crops: it is faster at batches of changing size.
     """
     takes_batches = any(isinstance(spec.shape[0], str) for spec in manifest.inputs.values())
     return "cpu" if wanted == "openvino" and takes_batches else wanted
 
 
 def open_runtime(file: ManifestFile, *, threads: int, provider: Provider, folder: Path | None) -> Runtime:
-    """The model, opened by the provider that was asked for, with its engines in ``folder``.
+    """Opens the model with exactly this provider; its engines are in ``folder``.
 
-    Raises ModelError where that cannot be: never another provider in its place.
+    Raises ModelError if the provider cannot be used, and UnavailableError without enough memory.
     """
     if provider not in available():
         missing, instead = "OpenVINO is not installed", "flockd[openvino]"
@@ -89,7 +89,7 @@ def open_runtime(file: ManifestFile, *, threads: int, provider: Provider, folder
             ("file",),
             f"{file.model} cannot be loaded by {name} ({reason}); fix what it says, or write perception.provider: cpu",
         ) from None
-    # Where a provider's libraries do not load, ONNX Runtime only warns and takes the CPU.
+    # If a provider's libraries do not load, ONNX Runtime only warns and uses the CPU.
     wanted = EXECUTION_PROVIDERS[provider]
     if runtime.provider != wanted:
         raise ModelError(
@@ -104,9 +104,9 @@ def _session(file: ManifestFile, threads: int, provider: Provider, folder: Path 
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
     options.log_severity_level = 3
-    options.enable_mem_pattern = False  # one block for all tensors of a run holds 30 MB more and is no faster
+    options.enable_mem_pattern = False  # one block for all tensors takes 30 MB more and is no faster
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    in_8_bits = bool(file.manifest.providers)  # the few layers in float gain nothing from a layout of their own
+    in_8_bits = bool(file.manifest.providers)  # its few float layers gain nothing from another memory layout
     return ort.InferenceSession(
         str(file.model),
         options,
@@ -129,29 +129,29 @@ def _providers(provider: Provider, folder: Path | None) -> list[tuple[str, dict[
                 "trt_timing_cache_enable": "1",
                 "trt_timing_cache_path": str(folder),
             }
-        # What TensorRT has no layer for runs beside it on the GPU.
+        # CUDA runs the layers that TensorRT lacks.
         return [(EXECUTION_PROVIDERS["tensorrt"], options), cuda]
     return [cuda] if provider == "cuda" else [(EXECUTION_PROVIDERS[provider], options)]
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """The shapes of inputs that a model's engines were built for; an engine is there for all between them too."""
+    """The shapes of inputs that a model's engines were built for; the engines also cover all shapes between them."""
 
     shapes: Sequence[Shapes]
 
     @staticmethod
     def load(folder: Path | None) -> Prepared | None:
-        """What `save` wrote; None where nothing was prepared."""
+        """Reads the file that `save` wrote; None: no engines were prepared."""
         stamp = None if folder is None else folder / _STAMP
         return Prepared(json.loads(stamp.read_text(encoding="utf-8"))) if stamp and stamp.is_file() else None
 
     def save(self, folder: Path) -> None:
-        """Beside the engines, once they are whole."""
+        """Writes the shapes beside the engines; call it once they are complete."""
         (folder / _STAMP).write_text(json.dumps(self.shapes), encoding="utf-8")
 
     def covers(self, shapes: Shapes) -> bool:
-        """Whether an engine is there for these."""
+        """Whether the engines cover these shapes."""
         for name, shape in shapes.items():
             built = [one.get(name, ()) for one in self.shapes]
             if any(len(one) != len(shape) for one in built):

@@ -18,23 +18,23 @@ if TYPE_CHECKING:
 
 Arrays = Mapping[str, NDArray[Any]]
 _Shapes = tuple[tuple[int, ...], ...]
-"""Of all inputs, in the model's order."""
+"""Shapes of all inputs, in the model's order."""
 
 
 class Runtime(Protocol):
-    """A model that a library has opened. ``run`` may be called from any thread."""
+    """A model opened by a library. ``run`` may be called from any thread."""
 
     provider: str
-    """What really computes it, by the library's own account."""
+    """The provider that computes it, as the library reports."""
     inputs: Sequence[Tensor]
     outputs: Sequence[Tensor]
 
     def run(self, names: Sequence[str], feeds: Arrays) -> list[NDArray[Any]]:
-        """The outputs of these names. Raises the library's own errors."""
+        """Returns the outputs of these names. Raises errors of the library."""
         ...
 
     def terminate(self) -> None:
-        """Ends the runs that are under way, from any thread: they raise."""
+        """Ends the current runs, from any thread; they raise errors of the library."""
         ...
 
 
@@ -72,12 +72,12 @@ class _Tensor:
 
 
 class OpenVino:
-    """A model that OpenVINO compiles for each shape of input: that computes in two thirds of the time of any shape."""
+    """A model compiled by OpenVINO for each shape of its inputs: it takes two thirds of the time of free shapes."""
 
     provider = "OpenVINO"
 
     def __init__(self, path: Path, threads: int, folder: Path | None) -> None:
-        """``threads``: of one run; ``folder``: where what was compiled is kept. Raises OpenVINO's own errors."""
+        """``threads``: for one run; ``folder``: for compiled models. Raises OpenVINO's errors."""
         import openvino  # noqa: PLC0415 - an extra
 
         self._core = openvino.Core()
@@ -85,8 +85,8 @@ class OpenVino:
         self._options: dict[str, Any] = {
             "INFERENCE_NUM_THREADS": threads,
             "NUM_STREAMS": 1,
-            "ENABLE_CPU_PINNING": False,  # or all runs at once would share the first core
-            "INFERENCE_PRECISION_HINT": "f32",  # or some processors would round floats to 16 bits, and others not
+            "ENABLE_CPU_PINNING": False,  # with it, simultaneous runs share the first core
+            "INFERENCE_PRECISION_HINT": "f32",  # without it, some processors round to 16 bits
         }
         if folder is not None:
             self._options["CACHE_DIR"] = str(folder)
@@ -109,11 +109,11 @@ class OpenVino:
 
     @contextmanager
     def _request(self, shapes: _Shapes) -> Iterator[openvino.InferRequest]:
-        """One that no other thread has: what was compiled once computes one run at a time."""
+        """A request that no other thread uses: each one computes one run at a time."""
         idle = self._idle.setdefault(shapes, [])
         try:
             request = idle.pop()
-        except IndexError:  # or another thread was faster
+        except IndexError:  # all are in use
             request = self._compiled(shapes)
         self._running.add(request)
         try:

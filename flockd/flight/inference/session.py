@@ -1,4 +1,4 @@
-"""One ONNX model in memory: opened with a checked file, the wanted provider and its golden output."""
+"""One ONNX model in memory; its file, provider and golden output are checked when it is opened."""
 
 from __future__ import annotations
 
@@ -45,15 +45,15 @@ class OnnxModel:
         check: Check = nothing_more,
         deadline: Deadline = no_deadline,
     ) -> None:
-        """Open and check it; ``ModelError`` says what is wrong, and where.
+        """Opens and checks the model. Raises ModelError with file, line, key and what to do.
 
         Args:
             path: the manifest.
-            threads: on the CPU.
-            provider: what computes it; never another in its place, but for crops (`provider_of`).
-            engines: where providers keep what they build.
-            preparing: whether a provider that is slow to build may do so now.
-            check: what else has to be true of the manifest.
+            threads: for one run on the CPU.
+            provider: computes the model, with the exception of crops (`provider_of`); it is never replaced silently.
+            engines: the folder of engines.
+            preparing: whether a provider that is slow to build engines may do so now.
+            check: further requirements of the manifest.
             deadline: for the run on the golden input.
         """
         file = read_manifest(path, check)
@@ -75,18 +75,18 @@ class OnnxModel:
 
     @property
     def provider(self) -> str:
-        """What really runs it, by the library's own account, which may not be what was asked for."""
+        """The provider that computes it, as the library reports; see `provider_of`."""
         return self._runtime.provider
 
     @property
     def engines(self) -> Path | None:
-        """The folder of what its provider builds; None where it builds nothing."""
+        """The folder of its engines; None: its provider builds none."""
         return self._engines
 
     def run(self, feeds: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-        """The outputs by name. ``FloatingPointError`` when one is not finite.
+        """The outputs by name.
 
-        ``ValueError`` for inputs of a shape that an engine would first have to be built for, and ought not to now.
+        Raises FloatingPointError if one is not finite, and ValueError for inputs of a shape without an engine.
         """
         if not self._may_build and not (self._prepared and self._prepared.covers(shapes_of(feeds))):
             raise ValueError(f"model {self.manifest.name} is not prepared for inputs of {shapes_of(feeds)}")
@@ -98,7 +98,7 @@ class OnnxModel:
         return outputs
 
     def infer(self, contents: Mapping[str, Sequence[UInt8Array] | Float32Array]) -> dict[str, Float32Array]:
-        """The outputs by what they give, in their units, for inputs by what they carry.
+        """The outputs by their content, in their units; ``contents`` has the inputs by theirs.
 
         Images are (h, w, 3) RGB of the input's size, planes (n, c, h, w). Raises as ``run`` does.
         """
@@ -110,12 +110,12 @@ class OnnxModel:
         return {specs[name].gives or name: leaving(specs[name], value) for name, value in self.run(feeds).items()}
 
     def keep_engines(self, shapes: Sequence[Shapes]) -> None:
-        """Note that the engines in the folder cover these shapes and all between them."""
+        """Records that the engines in the folder cover these shapes and all between them."""
         if self._engines is not None:
             Prepared(shapes).save(self._engines)
 
     def terminate(self) -> None:
-        """Ends the runs that are under way, from any thread; they then raise an error of the library's own."""
+        """Ends the current runs, from any thread; they raise errors of the library."""
         self._runtime.terminate()
 
     def _refuse_provider(self, file: ManifestFile, provider: Provider) -> None:

@@ -1,4 +1,4 @@
-"""Where camera frames come from: devices of this computer, GStreamer pipelines, ROS 2, or shared memory."""
+"""Sources of camera frames: devices of this computer, GStreamer pipelines, ROS 2, or shared memory."""
 
 import time
 from collections.abc import Callable
@@ -13,11 +13,10 @@ __all__ = ["CameraStatus", "Count", "FramePublisher", "FrameSource", "open_sourc
 
 
 def open_source(config: DroneConfig, file: str, *, clock: Callable[[], float] = time.monotonic) -> FrameSource:
-    """The source that a drone's configuration asks for, not started yet; ``file`` is named in errors.
+    """The source that a drone's configuration names, not started yet.
 
-    ``clock`` is that of shared memory: frames of devices have the kernel's.
-
-    Raises ConfigError if it asks for none.
+    ``file`` is named in errors. ``clock`` is used for shared memory only: frames of devices have the kernel's times.
+    Raises ConfigError if the configuration has no section `source`.
     """
     if config.source is None:
         raise ConfigError.at(file, "is missing; add one, as in config/quadrotor.yaml", "source")

@@ -1,4 +1,4 @@
-"""Puts the frames of several cameras together into sets by time stamp, from whatever threads bring them."""
+"""Combines the frames of several cameras into frame sets by time stamp; cameras may deliver on any threads."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from flockd.onboard.sources.frames import CameraStatus, Count, RawFrame
 from flockd.onboard.sources.image_formats import CorruptImageError
 
 _MOST_HELD = 16
-"""Frames kept of one camera, however fast it is."""
+"""Largest number of frames kept of one camera."""
 
 
 @dataclass(frozen=True, eq=False)
 class RawFrameSet:
-    """Frames of one time; a camera that has none near it is absent."""
+    """Frames of one time; a camera without a frame near it is absent."""
 
     time_s: float
     frames: Mapping[str, RawFrame]
@@ -36,25 +36,26 @@ class _Held:
 
 @dataclass
 class _Line:
-    """What is known of one camera."""
+    """State of one camera."""
 
     held: deque[_Held] = field(default_factory=deque)
     last: RawFrame | None = None
     repeats: int = 0
     usable_s: float = -math.inf
-    """When its last usable frame arrived."""
+    """Arrival time of its last usable frame."""
     awaited: bool = True
     counts: Counter[Count] = field(default_factory=Counter)
 
 
 class Assembler:
-    """Puts single frames together to sets; the newest set wins.
+    """Combines single frames into sets; `take` returns the newest one.
 
-    A set is complete when every awaited camera has a frame within ``set_tolerance_s`` of the set's time, which is the
-    stamp of one of its frames. ``set_wait_s`` after a frame came its set is handed out incomplete, and a missing camera
-    is not awaited again before its next usable frame. Set times increase, and no frame is in two sets.
+    A set's time is the stamp of one of its frames. The set is complete when every awaited camera has a frame within
+    ``set_tolerance_s`` of that time. ``set_wait_s`` after the arrival of a frame its set is returned even if it is
+    incomplete; a camera that is missing from it is not awaited again before its next usable frame. The times of sets
+    increase, and each frame is in at most one set.
 
-    ``now_s`` is the caller's clock; it is only compared with itself, never with time stamps.
+    ``now_s`` is on the caller's clock; it is never compared with time stamps.
     """
 
     def __init__(self, cameras: Sequence[str], parameters: SourceParameters) -> None:
@@ -65,7 +66,7 @@ class Assembler:
         self._last_set_s = -math.inf
 
     def offer(self, frame: RawFrame, now_s: float) -> Count | None:
-        """Takes a frame of a known camera; gives what it is refused for, None for a usable one."""
+        """Takes a frame of a known camera. Returns why it is refused; None: it is usable."""
         line = self._lines[frame.camera]
         line.counts["received"] += 1
         refused = self._judge(line, frame)
@@ -81,7 +82,7 @@ class Assembler:
         return None
 
     def take(self, now_s: float) -> RawFrameSet | None:
-        """The newest set that is ready; None if there is none newer than the last."""
+        """The newest set that is ready; None if no set is newer than the last one returned."""
         awaited = {name for name, line in self._lines.items() if line.awaited}
         best: RawFrameSet | None = None
         stamps = {held.frame.time_s for line in self._lines.values() for held in line.held}
@@ -96,20 +97,20 @@ class Assembler:
         return None
 
     def count(self, camera: str, what: Count) -> None:
-        """Adds something that happened outside to a camera's counts."""
+        """Adds one to a count of a camera."""
         self._lines[camera].counts[what] += 1
 
     def spoil(self, camera: str, *what: Count) -> None:
-        """A frame of the last set turned out to be worth nothing: the set is without this camera."""
+        """Corrects the counts after a frame of the last set turned out to be unusable: its camera counts as missing."""
         self._lines[camera].counts.update((*what, "missing"))
         self._lines[camera].counts["used"] -= 1
 
     def counts(self, camera: str) -> dict[Count, int]:
-        """Counts of what happened to a camera's frames so far, without zeros."""
+        """A camera's counts so far, without zeros."""
         return {what: count for what, count in self._lines[camera].counts.items() if count}
 
     def age_s(self, camera: str, now_s: float) -> float:
-        """Since the camera's last usable frame arrived; infinite before the first."""
+        """Time since the camera's last usable frame arrived; infinite before the first."""
         return now_s - self._lines[camera].usable_s
 
     def _judge(self, line: _Line, frame: RawFrame) -> Count | None:
@@ -160,21 +161,21 @@ class Assembler:
 
 
 _TICK_S = 0.01
-"""How often a waiting reader checks whether a set that is not complete has waited long enough."""
+"""Interval at which a waiting reader checks whether an incomplete set has waited long enough."""
 
 _USELESS_AFTER = 3
-"""So many frames in a row that are worth nothing are a fault of their camera; the drone flies on by the others."""
+"""After this many unusable frames in a row their camera is reported as faulty; the drone flies on with the others."""
 
 _BLOCK_PX = 16
-"""Of JPEG, with colours at half the resolution."""
+"""Side of a block of JPEG with colours at half the resolution."""
 _FROZEN = "{}: the image is frozen; restart its camera or program"
 
 MAX_AHEAD_S = 0.02
-"""Drivers that work out time stamps from the camera's own clock may be this much ahead."""
+"""A driver that computes time stamps from the camera's own clock may be ahead by this much."""
 
 
 class FrameReceiver:
-    """What all sources have in common: the assembler behind a lock, and the decoding in front of it."""
+    """Base of all sources: guards the assembler with a lock, and decodes the frames of the sets that it returns."""
 
     def __init__(
         self,
@@ -191,23 +192,23 @@ class FrameReceiver:
         self._useless: Counter[str] = Counter()
         """Images in a row that could not be decoded, by camera."""
         self._parts: dict[str, tuple[UInt8Array, int]] = {}
-        """Of cameras that share an image: what each showed when its part last changed, and the number of that frame."""
+        """For cameras that share an image: each one's part when it last changed, and the number of that frame."""
         self._still: set[str] = set()
-        """Those whose part is frozen."""
+        """Cameras whose part is frozen."""
         self._refused: Counter[str] = Counter()
-        """Frames in a row that `refuse` was called for, by camera."""
+        """Frames in a row that `refuse` counted, by camera."""
         self._changed = threading.Condition()
         self._stopped = False
 
     def is_of_now(self, time_s: float, max_age_s: float) -> bool:
-        """Whether a time stamp is of the receiver's clock and not older than that; one ahead would silence all cameras.
+        """Whether a time stamp may be on the receiver's clock: not in the future, and at most ``max_age_s`` old.
 
-        False for NaN.
+        False for NaN. Set times increase, so one stamp in the future would block all cameras until then.
         """
         return -MAX_AHEAD_S <= self._clock() - time_s <= max_age_s
 
     def offer(self, frame: RawFrame) -> Count | None:
-        """Takes a frame from any thread; gives what it is refused for, None for a usable one."""
+        """Takes a frame from any thread. Returns why it is refused; None: it is usable."""
         with self._changed:
             refused = self._assembler.offer(frame, self._clock())
             if refused is None:
@@ -220,13 +221,13 @@ class FrameReceiver:
         return refused
 
     def count(self, camera: str, *what: Count) -> None:
-        """Counts what happened to a camera, or to a frame of it that is worth nothing."""
+        """Adds one to each of these counts of a camera."""
         with self._changed:
             for one in what:
                 self._assembler.count(camera, one)
 
     def refuse(self, camera: str, what: Count, sentence: str) -> None:
-        """Counts a frame that is worth nothing; with `_USELESS_AFTER` in a row the sentence says why none comes."""
+        """Counts an unusable frame. After `_USELESS_AFTER` in a row ``sentence`` becomes the camera's fault."""
         with self._changed:
             self._assembler.count(camera, "received")
             self._assembler.count(camera, what)
@@ -235,7 +236,7 @@ class FrameReceiver:
                 self._faults[camera] = sentence
 
     def fault(self, camera: str, sentence: str) -> None:
-        """Says why a camera gives nothing, until it gives something."""
+        """Sets a camera's fault, one sentence, until its next usable frame."""
         with self._changed:
             self._faults[camera] = sentence
 
@@ -261,7 +262,7 @@ class FrameReceiver:
             }
 
     def stop(self) -> None:
-        """See ``FrameSource``; lets a waiting reader go."""
+        """See ``FrameSource``; wakes a waiting reader."""
         with self._changed:
             self._stopped = True
             self._changed.notify_all()
@@ -298,8 +299,8 @@ class FrameReceiver:
         return Frame(raw.camera, image, raw.time_s, raw.sequence)
 
     def _is_still(self, raw: RawFrame, image: UInt8Array) -> bool:
-        """Whether a camera's part has not changed for as many images as make a whole one frozen. JPEG's blocks reach
-        across the border to the next part."""
+        """Whether a camera's part has not changed for `frozen_after` images. Its border is left out, as a JPEG block
+        there also covers the next part."""
         border = min(_BLOCK_PX, *(side // 4 for side in image.shape[:2]))
         image = image[border:-border, border:-border]
         before, number = self._parts.get(raw.camera, (None, 0))

@@ -1,18 +1,18 @@
-"""The process of a camera that is no device of the kernel: runs a GStreamer pipeline, or listens to topics of ROS 2.
+"""The separate process of one camera: runs a GStreamer pipeline, or subscribes to topics of ROS 2.
 
-camera_child.py gstreamer CAPS        # the pipeline comes over standard input, as its length and UTF-8
+camera_child.py gstreamer CAPS        # reads the pipeline from standard input: its length, then UTF-8
 camera_child.py ros TOPIC CAMERA_INFO_TOPIC system|simulator
 
-It needs nothing of flockd. GStreamer is called by its C interface; topics need rclpy. It ends when its standard input
-is closed. What it writes to standard output is a row of messages, each a header and its data:
+It imports nothing of flockd, calls GStreamer through its C interface, and needs rclpy for topics. It ends when its
+standard input is closed. It writes messages to standard output, each a header and its data:
 
-- `caps`: what a pipeline's images are from now on, as GStreamer writes it; a text.
-- `imag`: one image, its time in nanoseconds of CLOCK_MONOTONIC (-1: it has none), and whether it is damaged; of a topic
-  an Image: an `IMAGE_HEAD` and the data. `jpeg`: likewise a CompressedImage.
+- `caps`: the format of a pipeline's next images, as GStreamer's text.
+- `imag`: one image, its time in nanoseconds of CLOCK_MONOTONIC (-1: no time), and whether it is damaged. The data of an
+  Image of ROS begin with an `IMAGE_HEAD`. `jpeg`: likewise a CompressedImage.
 - `info`: the `INFO_BODY` of a CameraInfo.
-- `fail`: why there will be no more images; a text. `end`: the pipeline has ended by itself.
+- `fail`: why no more images will come; a text. `end`: the pipeline has ended by itself.
 
-A topic is waited for, and taken as its publishers offer it: reliably where all do, else by best effort.
+It waits for a topic's publishers, and subscribes reliably if all of them are reliable, else with best effort.
 """
 
 from __future__ import annotations
@@ -39,16 +39,16 @@ NO_TIME = -1
 NOT_INSTALLED, NO_ROS = "GStreamer is not installed", "there is no rclpy"
 IMAGES = {"sensor_msgs/msg/Image": (IMAGE, "Image"), "sensor_msgs/msg/CompressedImage": (COMPRESSED, "CompressedImage")}
 IMAGE_HEAD = struct.Struct("<64sIII")
-"""The encoding or format; width, height and bytes a line of an Image."""
+"""Encoding or format; width, height and bytes per line of an Image."""
 INFO_BODY = struct.Struct("<II4d")
 """Width, height; fx, fy, cx, cy."""
 
 _END_S = 1.0
-"""Given to a pipeline to close its camera."""
+"""Time for a pipeline to close its camera."""
 _SINK = b"flockd_sink"
 _LOOK_NS = 50_000_000
 _PREROLL_NS = 3_000_000_000
-"""A pipeline that has not said by then whether it is live is a file."""
+"""A pipeline that has not reported by then whether it is live reads a file."""
 _PAUSED, _PLAYING, _NULL = 3, 4, 1  # GstState
 _FAILED, _LIVE = 0, 3  # GST_STATE_CHANGE_FAILURE, _NO_PREROLL
 _TIME = 3  # GST_FORMAT_TIME
@@ -58,7 +58,7 @@ _CORRUPTED = 1 << 8  # GST_BUFFER_FLAG_CORRUPTED
 _READ = 1  # GST_MAP_READ
 _TOPIC_LOOK_S = 0.1
 _CLOCK_S = 0.5
-"""So long one reading of a simulator's clock counts: it may have come late, and then a later one is better."""
+"""Time for which readings of a simulator's clock are kept: some arrive late, so the one with the least delay counts."""
 
 
 class Buffer(ctypes.Structure):
@@ -86,13 +86,13 @@ class _Error(ctypes.Structure):
 
 
 class _NoImagesError(Exception):
-    """Why there are no images."""
+    """No images can be had; the text says why."""
 
 
 def main() -> None:
-    """Runs until there are no more images or the other side goes."""
+    """Runs until the images end or the parent process closes a pipe."""
     output = os.dup(1)
-    os.dup2(2, 1)  # drivers and ROS print, and this is no place for it
+    os.dup2(2, 1)  # drivers and ROS print; that must not mix with messages
     stopping = threading.Event()
     kind, *arguments = sys.argv[1:]
     pipeline = read_text() if kind == "gstreamer" else ""
@@ -109,18 +109,18 @@ def main() -> None:
             reason = NO_ROS if getattr(error, "name", None) == "rclpy" else str(error).splitlines()[0]
             send(output, ERROR, data=reason.encode())
     except BrokenPipeError:
-        pass  # the other side has gone
+        pass  # the parent has closed the pipe
     os._exit(0)  # threads of drivers may hang
 
 
 def packed_text(text: str) -> bytes:
-    """As `read_text` takes it."""
+    """A text in the form that `read_text` reads."""
     data = text.encode()
     return LENGTH.pack(len(data)) + data
 
 
 def read_text() -> str:
-    """What `packed_text` packed; empty where the other side has gone."""
+    """A text written with `packed_text`; empty if the pipe was closed."""
     with open(0, "rb", buffering=0, closefd=False) as source:
         header = _exactly(source, LENGTH.size)
         return _exactly(source, LENGTH.unpack(header)[0] if len(header) == LENGTH.size else 0).decode()
@@ -142,7 +142,7 @@ def _await_end(stopping: threading.Event, patience_s: float) -> None:
 
 
 def run(pipeline_text: str, caps: str, output: int, stopping: threading.Event) -> None:
-    """All images to the file descriptor ``output``. Raises _NoImagesError."""
+    """Writes all images to the file descriptor ``output``. Raises _NoImagesError."""
     gst = _library("libgstreamer-1.0.so.0", _GST)
     app = _library("libgstapp-1.0.so.0", _APP)
     gst.gst_init(None, None)
@@ -162,7 +162,7 @@ def run(pipeline_text: str, caps: str, output: int, stopping: threading.Event) -
 
 
 def _start(gst: ctypes.CDLL, pipeline: int, sink: int) -> None:
-    """Live images are fetched as they come; those of a file at their times."""
+    """Starts the pipeline. Live images are read as they come, those of a file at their times."""
     changed = gst.gst_element_set_state(pipeline, _PAUSED)
     if changed not in (_FAILED, _LIVE):
         changed = gst.gst_element_get_state(pipeline, None, None, _PREROLL_NS)
@@ -213,7 +213,7 @@ def _send_image(gst: ctypes.CDLL, pipeline: int, sample: int, output: int) -> No
 def send(
     output: int, kind: bytes, flags: int = 0, time_ns: int = 0, data: bytes | ctypes.Array[ctypes.c_char] = b""
 ) -> None:
-    """One message. Raises BrokenPipeError when nobody reads any more."""
+    """Writes one message. Raises BrokenPipeError if the parent has closed the pipe."""
     view = memoryview(data).cast("B")
     _write(output, memoryview(HEADER.pack(kind, flags, time_ns, len(view))))
     _write(output, view)
@@ -233,7 +233,7 @@ def _caps(gst: ctypes.CDLL, sample: int) -> bytes:
 
 
 def _failure(gst: ctypes.CDLL, pipeline: int) -> str | None:
-    """Why an element has failed; None while none has."""
+    """Why an element has failed; None: no element has."""
     bus = gst.gst_element_get_bus(pipeline)
     message = gst.gst_bus_pop_filtered(bus, _ERROR)
     gst.gst_object_unref(bus)
@@ -292,7 +292,7 @@ def _library(name: str, signatures: Mapping[str, tuple[Any, ...]]) -> ctypes.CDL
 
 
 def listen(topic: str, info_topic: str, stamps: str, output: int) -> None:
-    """For ever. Raises ImportError and _NoImagesError."""
+    """Writes all images of a topic, without end. Raises ImportError and _NoImagesError."""
     import rclpy  # noqa: PLC0415 - of ROS 2
     from rclpy.qos import QoSProfile, ReliabilityPolicy  # noqa: PLC0415
 
@@ -317,7 +317,7 @@ def listen(topic: str, info_topic: str, stamps: str, output: int) -> None:
 
 
 def packed(message: Any) -> bytes:
-    """An Image or CompressedImage as it is written."""
+    """The data of an `imag` or `jpeg` message."""
     if hasattr(message, "encoding"):
         head = IMAGE_HEAD.pack(message.encoding.encode(), message.width, message.height, message.step)
     else:
@@ -326,13 +326,13 @@ def packed(message: Any) -> bytes:
 
 
 def body_of(info: Any) -> bytes:
-    """A CameraInfo as it is written."""
+    """The data of an `info` message."""
     fx, _, cx, _, fy, cy, *_ = info.k
     return INFO_BODY.pack(info.width, info.height, fx, fy, cx, cy)
 
 
 def _wait_for(node: Any, topic: str) -> tuple[bytes, str, bool]:
-    """What comes there, and whether all who publish it do so reliably."""
+    """Waits for publishers: the message kind, the type's name, and whether all publishers are reliable."""
     from rclpy.qos import ReliabilityPolicy  # noqa: PLC0415
 
     while True:
@@ -347,11 +347,11 @@ def _wait_for(node: Any, topic: str) -> tuple[bytes, str, bool]:
 
 
 class _Clock:
-    """From stamps to CLOCK_MONOTONIC."""
+    """Converts time stamps to CLOCK_MONOTONIC."""
 
     def __init__(self) -> None:
         self._readings: deque[tuple[int, int]] = deque()
-        """When a simulator's clock came, and by how much that is more than it said."""
+        """Arrival time of each reading of a simulator's clock, and arrival time minus reading."""
 
     def take(self, stamp_ns: int) -> None:
         now_ns = time.monotonic_ns()
@@ -360,7 +360,7 @@ class _Clock:
             self._readings.popleft()
 
     def monotonic_ns(self, stamp_ns: int, *, simulated: bool) -> int:
-        """Of an image's stamp; `NO_TIME` before a simulator's clock came."""
+        """An image's stamp, ns of CLOCK_MONOTONIC; `NO_TIME` before the first reading of a simulator's clock."""
         if not simulated:
             return stamp_ns + time.monotonic_ns() - time.time_ns()
         if not self._readings:

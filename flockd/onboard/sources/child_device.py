@@ -1,8 +1,4 @@
-"""Cameras that a separate process reads, so that a driver that crashes ends this process alone.
-
-The process writes messages to its standard output, each a header and its data, and ends when its standard input is
-closed.
-"""
+"""Cameras that are read in a separate process: if a driver crashes, flockd goes on. See `camera_child`."""
 
 from __future__ import annotations
 
@@ -27,11 +23,11 @@ from flockd.onboard.sources.image_formats import ImageFormat
 
 CHILD = (sys.executable, "-I", str(Path(camera_child.__file__)))
 ROS_CHILD = (sys.executable, "-P", CHILD[-1])
-"""rclpy may be on the environment's path; the folder of the file is not, whose names would hide other packages."""
+"""Keeps PYTHONPATH for rclpy, but not this folder, whose names would hide other packages."""
 _PIPE_BYTES = 1 << 20
-"""The largest pipe of an ordinary user; fewer system calls an image than with the usual 64 kB."""
+"""The largest pipe that Linux allows a user: an image takes fewer system calls than with the default 64 kB."""
 _MOST_BYTES = 1 << 28
-"""The most bytes of one image: the largest that a rig may have is less."""
+"""Largest size of one image; the largest permitted in a rig is smaller."""
 _END_S = 1.5
 
 
@@ -46,16 +42,14 @@ class ChildMessage:
 
 
 class ChildDevice(CameraDevice):
-    """A ``CameraDevice`` of a process. Images are numbered by their times, in periods of the rate.
-
-    So a number that is missing is a frame that is.
-    """
+    """A ``CameraDevice`` in a separate process. Images are numbered by their times, in periods of the configured rate,
+    so that a lost frame leaves a gap in the numbers."""
 
     start_s = 10.0
     _what: str
-    """What the process runs, for messages."""
+    """What the process runs, for errors."""
     _kinds: Collection[bytes]
-    """Messages beside errors and the end."""
+    """Kinds of messages besides `fail` and `end`."""
 
     def __init__(
         self,
@@ -66,7 +60,7 @@ class ChildDevice(CameraDevice):
     ) -> None:
         """Starts the process, and writes ``told`` to its standard input. Raises CameraError.
 
-        Every user of the computer can read arguments, and what is told may hold a password.
+        ``told`` may contain a password, and every user of the computer can read a process's arguments.
         """
         self._name, self._rate_hz, self._size = camera.name, camera.rate_hz, size
         self._size_words = camera.size_words
@@ -79,14 +73,14 @@ class ChildDevice(CameraDevice):
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 bufsize=0,
-                start_new_session=True,  # Ctrl-C is not for it
+                start_new_session=True,  # Ctrl-C must not reach it
             )
         except OSError as error:
             raise CameraError(
                 f"{self._name}: the process of {self._what} cannot be started ({error.strerror})"
             ) from error
         assert self._process.stdin is not None and self._process.stdout is not None
-        with contextlib.suppress(BrokenPipeError):  # it has ended, which `read` says
+        with contextlib.suppress(BrokenPipeError):  # it has ended; `read` reports that
             self._process.stdin.write(told)
         self._stream = _Stream(self._process.stdout.fileno(), {*self._kinds, ERROR, END})
 
@@ -97,14 +91,14 @@ class ChildDevice(CameraDevice):
             if message.kind == ERROR:
                 raise self._failed(message.data.decode("utf-8", "replace"))
             if message.kind == END:
-                raise CameraError(f"{self._name}: {self._what} has ended; a camera's goes on for ever")
+                raise CameraError(f"{self._name}: {self._what} has ended; use one that does not end")
             captured = self._taken(message)
             if captured is not None:
                 return captured
         return None
 
     def close(self) -> None:
-        """Lets the process close its camera, and ends it, if need be by force."""
+        """Lets the process close its camera and end; kills it if it does not end in time."""
         for pipe in (self._process.stdin, self._process.stdout):
             assert pipe is not None
             with contextlib.suppress(OSError):
@@ -117,11 +111,11 @@ class ChildDevice(CameraDevice):
 
     @abstractmethod
     def _taken(self, message: ChildMessage) -> CapturedBuffer | None:
-        """The image of a message; None for one that says something else. Raises CameraError."""
+        """The image of a message; None: the message has no image. Raises CameraError."""
 
     @abstractmethod
     def _failed(self, reason: str) -> CameraError:
-        """The sentence for an error that the process reports."""
+        """The error for a reason that the process reports."""
 
     def image_format(self) -> ImageFormat:
         """See ``CameraDevice``."""
@@ -129,7 +123,7 @@ class ChildDevice(CameraDevice):
         return self._format
 
     def _check_size(self, size: tuple[int, int], who: str, remedy: str) -> None:
-        """Raises CameraError for another width and height than the rig's."""
+        """Raises CameraError if width and height differ from the rig's."""
         if size != self._size:
             gives, asked = (f"{width}x{height}" for width, height in (size, self._size))
             whose, key = self._size_words
@@ -144,7 +138,10 @@ class ChildDevice(CameraDevice):
         return CapturedBuffer(data, time_s, self._sequence, bool(message.flags & DAMAGED))
 
     def _nonsense(self) -> CameraError:
-        return CameraError(f"{self._name}: the process of {self._what} sent what is no image; something in it prints")
+        return CameraError(
+            f"{self._name}: the process of {self._what} sent no image but other data; "
+            "stop the element or driver that prints to standard output"
+        )
 
     def _next(self, timeout_s: float) -> ChildMessage | None:
         try:
@@ -164,11 +161,11 @@ class ChildDevice(CameraDevice):
 
 
 class _Stream:
-    """Messages from a pipe, whole ones only."""
+    """Reads complete messages from a pipe."""
 
     def __init__(self, descriptor: int, kinds: Collection[bytes]) -> None:
         self._descriptor, self._kinds = descriptor, kinds
-        with contextlib.suppress(OSError):  # more is quicker, not needed
+        with contextlib.suppress(OSError):  # a larger pipe is faster, but not required
             fcntl.fcntl(descriptor, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
         self._poll = select.poll()
         self._poll.register(descriptor, select.POLLIN)
@@ -176,9 +173,9 @@ class _Stream:
         self._expect(HEADER.size)
 
     def read(self, timeout_s: float) -> ChildMessage | None:
-        """The next one; None if it is not complete within the time.
+        """The next message; None if it is not complete within ``timeout_s``.
 
-        Raises EOFError at the end, and ValueError for what is no message.
+        Raises EOFError at the end, and ValueError if the data are not a message.
         """
         until_s = time.monotonic() + timeout_s
         while self._poll.poll(max(until_s - time.monotonic(), 0.0) * 1000.0):

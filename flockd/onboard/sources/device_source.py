@@ -1,4 +1,4 @@
-"""Cameras of this computer: one thread each fetches its frames, notices silence, and opens it again."""
+"""Cameras of this computer: a thread for each reads its frames, and opens it again if it fails or falls silent."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ from flockd.onboard.sources.v4l2_device import V4l2Device
 from flockd.onboard.sources.v4l2_kernel import Kernel
 
 _LOOK_S = 0.05
-"""How long a thread waits for a frame before it checks whether it should stop."""
+"""Interval at which a thread without frames checks whether it should stop."""
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 2.0
 _STOP_S = 1.0
-"""A thread that hangs in a driver for longer is left to end with the process."""
+"""Time for threads to stop; one that hangs in a driver for longer ends with the process."""
 
 
 @dataclass(frozen=True)
 class Devices:
-    """Opens cameras: those with a pipeline or a topic by a process each, all others by the ``kernel``."""
+    """Opens cameras: each pipeline or topic in a process of its own, all others through the ``kernel``."""
 
     kernel: Kernel = field(default_factory=Kernel)
     command: Sequence[str] = CHILD
     ros_command: Sequence[str] = ROS_CHILD
     lenses: Mapping[str, IntrinsicsConfig] = field(default_factory=dict)
-    """Of the rig, by camera: what a topic's CameraInfo must not contradict."""
+    """Intrinsics in the rig, by camera; a topic's CameraInfo must agree with them."""
 
     def open(self, camera: CameraDeviceParameters, size: tuple[int, int]) -> CameraDevice:
-        """The camera, set up for images of this width and height, and started. Raises CameraError."""
+        """Opens and starts a camera for images of this ``size``, width and height. Raises CameraError."""
         if camera.pipeline:
             return GstreamerDevice(camera, size, self.command)
         if camera.topic:
@@ -47,7 +47,7 @@ class Devices:
 
 
 class DeviceSource(FrameReceiver):
-    """A ``FrameSource`` of the kernel's cameras, pipelines and topics, with their own time stamps and numbers."""
+    """A ``FrameSource`` for V4L2 cameras, GStreamer pipelines and ROS topics, with the stamps and numbers they give."""
 
     def __init__(
         self,
@@ -56,7 +56,7 @@ class DeviceSource(FrameReceiver):
         devices: Devices | None = None,
         on_frame: Callable[[RawFrame], None] = lambda frame: None,
     ) -> None:
-        """``sizes``: width and height by camera, each of which has its entry in ``parameters``.
+        """``sizes``: width and height of each camera in ``parameters``, by name.
 
         ``on_frame`` is called with each usable frame, on its camera's thread.
         """
@@ -88,7 +88,7 @@ class DeviceSource(FrameReceiver):
 
 
 class _Device(threading.Thread):
-    """The thread that keeps one device running, of one camera, or of several that are cut from its images."""
+    """The thread that keeps one device running, for one camera or for several that are cut from its images."""
 
     def __init__(
         self,
@@ -101,18 +101,18 @@ class _Device(threading.Thread):
         first = cameras[0]
         super().__init__(name=f"camera-{first.name}", daemon=True)
         self._parameters = first if first.crop is None else first.model_copy(update={"turn_deg": 0})
-        """Parts of an image are turned when they are cut, each by its own angle."""
+        """Without a turn if the image is cut: each part has its own angle, and is turned when it is cut out."""
         self._cameras, self._size, self._silence_s = cameras, size, silence_s
         self._receiver, self._devices = receiver, devices
         self._who = first.name
         self._delivered = False
-        """Whether this opening of the device has brought a usable frame."""
+        """Whether the device has delivered a usable frame since it was last opened."""
         self._has_delivered = False
-        """Whether any has."""
+        """Whether it has delivered one at all."""
         self.stopping = threading.Event()
 
     def run(self) -> None:
-        """Until ``stopping`` is set."""
+        """Runs until ``stopping`` is set."""
         pause_s = _FIRST_PAUSE_S
         while not self.stopping.is_set():
             self._delivered = False
@@ -122,16 +122,16 @@ class _Device(threading.Thread):
                     self._capture(device)
             except CameraError as error:
                 self._fault(str(error).removeprefix(f"{self._who}: "))
-            except Exception as error:  # noqa: BLE001 - the thread's border: a camera that fails so is seen, too
+            except Exception as error:  # noqa: BLE001 - an unexpected error is the camera's fault, not the thread's end
                 self._fault(f"cannot be run ({type(error).__name__}: {error})")
             pause_s = _FIRST_PAUSE_S if self._delivered else pause_s
             self.stopping.wait(pause_s)
             pause_s = min(2.0 * pause_s, _LONGEST_PAUSE_S)
 
     def _capture(self, device: CameraDevice) -> None:
-        """Until it is asked to stop; raises CameraError when the camera fails or falls silent."""
+        """Reads frames until ``stopping`` is set. Raises CameraError if the camera fails or falls silent."""
         usable_s, refused = time.monotonic(), None
-        left_over = self._has_delivered  # drivers may begin again with the last image of before, stamped as of now
+        left_over = self._has_delivered  # a driver may first repeat the last old image, with a new stamp
         while not self.stopping.is_set():
             captured = device.read(_LOOK_S)
             if captured is not None and left_over:
@@ -150,7 +150,7 @@ class _Device(threading.Thread):
 
     def _take(self, captured: CapturedBuffer, image_format: ImageFormat) -> Count | None:
         refused: Count | None = "flagged" if captured.flagged else None
-        # Some drivers do not say which clock is in their stamps: what is of now is of ours.
+        # Some drivers do not report the clock of their stamps: a stamp near now is on this computer's.
         if refused is None and not self._receiver.is_of_now(captured.time_s, self._silence_s):
             refused = "time_stamp"
         try:
@@ -175,7 +175,7 @@ class _Device(threading.Thread):
 def frames_of(
     cameras: Sequence[CameraDeviceParameters], captured: CapturedBuffer, image_format: ImageFormat
 ) -> Iterator[RawFrame]:
-    """The frames of all cameras of one image, whose data they share."""
+    """The frames of all cameras that are cut from one image; they share its data."""
     whole = SharedImage(image_format)
     for camera in cameras:
         decode = image_format.decode if camera.crop is None else whole.decoder(camera)

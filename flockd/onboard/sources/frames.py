@@ -1,4 +1,4 @@
-"""Frames as cameras send them, the devices that they come from, and the cameras' state as other parts see it."""
+"""The interfaces of sources and camera devices, raw frames, and the status of a camera."""
 
 from __future__ import annotations
 
@@ -12,100 +12,100 @@ from flockd.core.messages import FrameSet
 from flockd.onboard.sources.image_formats import Decoder, ImageFormat
 
 Count = Literal[
-    "received",  # came from the device or the network, whatever they were worth
-    "used",  # handed out in a set
-    "superseded",  # a newer frame was there before anybody asked
-    "late",  # came when its set had already gone
-    "missing",  # sets handed out without this camera
-    "lost",  # never came: gaps in the sequence numbers
-    "time_stamp",  # not after the one before, or not of this computer's monotonic clock
-    "frozen",  # the same image or sequence number again and again
-    "flagged",  # the driver itself says that the data are damaged
-    "corrupt",  # wrong size, cannot be decoded, or decodes into what no camera sees
-    "undecodable",  # those of the corrupt that were found so only when decoded, as few frames are
+    "received",  # all frames that arrived, usable or not
+    "used",  # returned in a set
+    "superseded",  # dropped for a newer one
+    "late",  # arrived after a set of its time was returned
+    "missing",  # sets without this camera
+    "lost",  # gaps in the sequence numbers
+    "time_stamp",  # not later than the one before, or not on this computer's monotonic clock
+    "frozen",  # the same image or sequence number repeated
+    "flagged",  # marked as damaged by the driver
+    "corrupt",  # wrong size, not decodable, or of one colour
+    "undecodable",  # those of the corrupt that were noticed only when decoded; few frames are
     "malformed",  # a message that is not a frame
-    "opened",  # times the device was opened
+    "opened",  # how often the device was opened
 ]
 
 
 @dataclass(frozen=True, eq=False)
 class RawFrame:
-    """One image as the camera sent it: not decoded, because most frames are superseded before they are used."""
+    """One image as the camera sent it. It is decoded only if it is used: most frames are superseded."""
 
     camera: str
     data: bytes
     decode: Decoder
-    """What makes an RGB image of the data."""
+    """Converts the data to an RGB image."""
     time_s: float
-    """Monotonic, when the image was taken."""
+    """Capture time, monotonic."""
     sequence: int
     shared: bool = False
-    """Other cameras' images are in these data too: they change when this camera's part does not."""
+    """Whether the data contain images of other cameras too, so that they change even if this camera's part does not."""
 
 
 @dataclass(frozen=True)
 class CameraStatus:
-    """How one camera is doing."""
+    """Status of one camera."""
 
     age_s: float
-    """Since its newest usable frame arrived; infinite before the first."""
+    """Time since its newest usable frame arrived; infinite before the first."""
     fault: str | None
-    """Why no usable frames come, in one sentence; None while they do, and as long as nothing is known."""
+    """Why no usable frames arrive, in one sentence; None: they do, or the reason is not known yet."""
     counts: Mapping[Count, int]
     """Since the start; a count that is missing is zero."""
 
 
 class FrameSource(Protocol):
-    """Cameras, wherever they are. One thread calls `newest`; the other methods are for any thread."""
+    """A source of camera frames. Call `newest` on one thread; the other methods on any."""
 
     def start(self) -> None:
-        """Begins to receive frames. A camera that is not there is no error: `status` says so, and it is tried again."""
+        """Begins to receive frames. A missing camera raises no error: `status` reports it, and it is tried again."""
 
     def newest(self, timeout_s: float = 0.0) -> FrameSet | None:
-        """The newest set that was not handed out before, decoded by the calling thread; older ones are dropped.
+        """The newest set that was not returned before, decoded on the calling thread; older ones are dropped.
 
-        Waits up to ``timeout_s`` for one; None if none comes, and at once after `stop`.
+        Waits up to ``timeout_s``. None: no set came, or the source was stopped.
         """
 
     def status(self) -> Mapping[str, CameraStatus]:
-        """How each camera is doing, by its name."""
+        """The status of each camera, by name."""
 
     def stop(self) -> None:
         """Closes everything; returns within a fraction of a second."""
 
 
 class CameraError(UnavailableError):
-    """Why a camera gives no frames, in one sentence."""
+    """A camera delivers no frames; the text, one sentence, says why."""
 
 
 @dataclass(frozen=True, eq=False)
 class CapturedBuffer:
-    """What the driver handed over: one image, its time and its number."""
+    """One image as the driver delivered it, with its time and number."""
 
     data: bytes
     time_s: float
     sequence: int
     flagged: bool
-    """The driver says that the data may be damaged."""
+    """Whether the driver marked the data as possibly damaged."""
 
 
 class CameraDevice(ABC):
-    """An open camera that streams; a context manager that closes it. Every method raises CameraError when it fails."""
+    """An open camera that streams; a context manager that closes it. Every method may raise CameraError."""
 
     start_s: float
-    """How long it may take to its first frame."""
+    """Longest time to its first frame."""
 
     @abstractmethod
     def read(self, timeout_s: float) -> CapturedBuffer | None:
-        """The next image; None if there is none within the time."""
+        """The next image; None if no image comes within ``timeout_s``."""
 
     @abstractmethod
     def image_format(self) -> ImageFormat:
-        """Format of the image that `read` gave last."""
+        """The format of the image that `read` returned last."""
 
     @abstractmethod
     def close(self) -> None:
-        """Stops the camera and gives it back."""
+        """Stops the camera and releases it."""
 
     def __enter__(self) -> Self:
         return self

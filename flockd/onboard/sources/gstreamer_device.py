@@ -1,6 +1,6 @@
-"""One camera behind a GStreamer pipeline that runs in a process of its own.
+"""A camera read through a GStreamer pipeline in a separate process.
 
-Such are those on the CSI ports of a Jetson or a Raspberry Pi, network cameras, and files.
+For cameras on the CSI ports of a Jetson or a Raspberry Pi, network cameras, and files.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ PACKAGES = "libgstreamer1.0-0, gstreamer1.0-plugins-base and the plugins that it
 
 
 class GstreamerDevice(ChildDevice):
-    """A ``CameraDevice`` of a pipeline. Its time stamps are those of GStreamer's buffers, on CLOCK_MONOTONIC."""
+    """A ``CameraDevice`` for a pipeline. Time stamps are those of GStreamer's buffers, on CLOCK_MONOTONIC."""
 
     _what, _kinds = "its pipeline", (CAPS, IMAGE)
 
     def __init__(self, camera: CameraDeviceParameters, size: tuple[int, int], command: Sequence[str] = CHILD) -> None:
-        """Starts the process: ``command``, with what is asked of the pipeline. Raises CameraError."""
+        """Starts the process: ``command`` with the caps wanted from the pipeline. Raises CameraError."""
         wanted = [*command, "gstreamer", caps(size, camera.rate_hz)]
         super().__init__(camera, size, wanted, told=packed_text(camera.place))
 
@@ -70,11 +70,11 @@ _FIELD = re.compile(r"(format|width|height)=\(\w+\)([^,;\s]+)")
 
 @dataclass(frozen=True)
 class PlanarFormat:
-    """Brightness first, then the colours of two by two pixels each; by BT.601, luma from 16 to 235."""
+    """A plane of luma, then chroma at half the resolution (NV12, I420); BT.601, luma from 16 to 235."""
 
     name: str
     size: tuple[int, int]
-    """Width, a multiple of eight, which GStreamer pads nowhere, and height, an even one."""
+    """Width, a multiple of 8, so that GStreamer pads no plane, and height, even."""
 
     def check(self, data: bytes) -> None:
         """See ``ImageFormat``: size."""
@@ -92,12 +92,12 @@ class PlanarFormat:
 
 
 def _formats(size: tuple[int, int]) -> tuple[str, ...]:
-    """Cheapest first: a pipeline that can choose gives the first."""
+    """Names of the formats that can be decoded, the cheapest first: a pipeline chooses the first that it can give."""
     return (*(_PLANAR if size[0] % 8 == size[1] % 2 == 0 else ()), *PACKED)
 
 
 def caps(size: tuple[int, int], rate_hz: float) -> str:
-    """What a pipeline is asked for: all that can be decoded, in the rig's size and rate where it can choose."""
+    """The caps wanted from a pipeline: all formats that can be decoded, preferably in the rig's size and rate."""
     formats = f"format=(string){{{','.join(_formats(size))}}}"
     kinds = ("image/jpeg", f"video/x-raw,{formats}")
     in_size = f",width={size[0]},height={size[1]}"
@@ -106,7 +106,7 @@ def caps(size: tuple[int, int], rate_hz: float) -> str:
 
 
 def format_of(text: str) -> tuple[ImageFormat, tuple[int, int]] | None:
-    """How to decode images of these caps, and their size; None for what was not asked for."""
+    """The format and size of images with these caps; None: they cannot be decoded."""
     fields = dict(_FIELD.findall(text))
     try:
         size = int(fields["width"]), int(fields["height"])

@@ -1,4 +1,4 @@
-"""From the bytes a camera sent to an RGB image, or the reason why not."""
+"""Decodes the bytes that a camera sent to an RGB image, or gives the reason why it cannot."""
 
 from __future__ import annotations
 
@@ -28,52 +28,50 @@ PACKED: Mapping[str, tuple[int, int | None]] = {
     "UYVY": (2, cv2.COLOR_YUV2RGB_UYVY),
     "GRAY8": (1, cv2.COLOR_GRAY2RGB),
 }
-"""Bytes a pixel, and OpenCV's conversion, by GStreamer's name."""
+"""Bytes per pixel, and OpenCV's conversion to RGB, by GStreamer's name."""
 _TURNS = {90: cv2.ROTATE_90_CLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.ROTATE_90_COUNTERCLOCKWISE}
 _REDUCING = {1: cv2.IMREAD_COLOR_RGB, 2: cv2.IMREAD_REDUCED_COLOR_2, 4: cv2.IMREAD_REDUCED_COLOR_4}
 _START, _END = b"\xff\xd8", b"\xff\xd9"
 _SAMPLE_STRIDE = 8
 _FLAT_DEVIATION = 1.0
-"""Standard deviation in grey levels below which a whole image shows nothing: the noise of a sensor alone is more."""
+"""Standard deviation in grey levels below which an image shows nothing: a sensor's noise alone exceeds it."""
 _LOST_SHARE = 16
-"""An image is cut off where its last 1/16 of rows is one value: what decoders fill in for data that never came."""
+"""An image is cut off if its last 1/16 of rows has one value: decoders fill in missing data that way."""
 _SATURATED = (8, 247)
-"""Between these a strip of one value is not just too dark or too bright."""
+"""Values beyond these may be of a scene that is too dark or too bright."""
 
 
 class CorruptImageError(ValueError):
-    """The bytes are no whole image of the right size; the text says why."""
+    """The bytes are not a complete image of the right size; the text says why."""
 
 
 class ImageFormat(Protocol):
-    """How a camera sends its images."""
+    """The format in which a camera sends its images."""
 
     def check(self, data: bytes) -> None:
-        """Raises CorruptImageError for what can be seen to be wrong without decoding: takes microseconds."""
+        """Raises CorruptImageError for errors that show without decoding; takes microseconds."""
 
     def pixels(self, data: bytes) -> UInt8Array:
-        """(height, width, 3) RGB, whatever it shows; raises CorruptImageError."""
+        """(height, width, 3) RGB, whatever it shows. Raises CorruptImageError."""
 
     def decode(self, data: bytes) -> UInt8Array:
-        """The same, which also raises CorruptImageError where a camera's image shows too little."""
+        """As `pixels`, and also raises CorruptImageError for an image without content: see `plausible`."""
 
 
 @dataclass(frozen=True)
 class MjpegFormat:
-    """A JPEG each; with or without its Huffman tables, which many cameras leave out."""
+    """One JPEG per image, with or without its Huffman tables, which many cameras leave out."""
 
     size: tuple[int, int]
     """Width, height."""
     reduce: Literal[1, 2, 4] = 1
-    """Of what comes out, each pixel is made of so many times so many: of the lower frequencies of each block."""
+    """Factor by which the decoded image is smaller, in each direction; the decoder leaves out high frequencies."""
 
     def check(self, data: bytes) -> None:
-        """See ``ImageFormat``: begin, end and size."""
+        """See ``ImageFormat``: checks begin, end and size."""
         if not data.startswith(_START):
             raise CorruptImageError("no JPEG begins here")
-        if (
-            not data.rstrip(b"\0").endswith(_END) and jpeg_end(data) is None
-        ):  # some cameras pad, most of them with zeros
+        if not data.rstrip(b"\0").endswith(_END) and jpeg_end(data) is None:  # some cameras append bytes, mostly zeros
             raise CorruptImageError("JPEG ends too early")
         found = jpeg_size(data)
         if found != self.size:
@@ -92,7 +90,7 @@ class MjpegFormat:
             raise CorruptImageError(f"JPEG cannot be decoded ({error})") from error
         if image is None:
             raise CorruptImageError("JPEG cannot be decoded")
-        if self.reduce > 1:  # OpenCV reduces in its own order of colours only
+        if self.reduce > 1:  # OpenCV reduces to BGR only
             image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
         return np.asarray(image, np.uint8)
 
@@ -103,19 +101,19 @@ class MjpegFormat:
 
 @dataclass(frozen=True)
 class PackedFormat:
-    """Whole pixels row by row; YUV by BT.601, luma from 16 to 235."""
+    """Packed pixels, row by row; YUV by BT.601, luma from 16 to 235."""
 
     name: str
-    """GStreamer's, of `PACKED`."""
+    """A key of `PACKED`."""
     size: tuple[int, int]
     """Width, height."""
     bytes_per_line: int | None = None
-    """None: each row is filled up to four bytes, as GStreamer does."""
+    """None: rows are padded to a multiple of four bytes, as in GStreamer."""
     reduce: Literal[1, 2, 4] = 1
-    """Of what comes out, each pixel is the mean of so many times so many."""
+    """Factor by which the decoded image is smaller, in each direction; each pixel is a mean."""
 
     def check(self, data: bytes) -> None:
-        """See ``ImageFormat``: size, and rows that hold their pixels."""
+        """See ``ImageFormat``: checks size and length of rows."""
         depth, width = PACKED[self.name][0], self.size[0]
         row = depth * (up_to(2, width) if depth == 2 else width)
         if self._bytes_per_line() < row:
@@ -133,7 +131,7 @@ class PackedFormat:
     def _whole(self, data: bytes) -> UInt8Array:
         self.check(data)
         (width, height), (depth, conversion) = self.size, PACKED[self.name]
-        across = up_to(2, width) if depth == 2 else width  # two pixels share their colours
+        across = up_to(2, width) if depth == 2 else width  # two pixels share their chroma
         rows = np.frombuffer(data, np.uint8).reshape(height, self._bytes_per_line())
         pixels = np.ascontiguousarray(rows[:, : depth * across]).reshape(height, across, depth)
         image = pixels if conversion is None else np.asarray(cv2.cvtColor(pixels, conversion), np.uint8)
@@ -151,7 +149,7 @@ class PackedFormat:
 
 @dataclass(frozen=True)
 class RgbFormat:
-    """Plain RGB, as a simulator draws it: whatever it shows is right."""
+    """Plain RGB of a simulator; any content is valid."""
 
     size: tuple[int, int]
     """Width, height."""
@@ -168,10 +166,10 @@ class RgbFormat:
 
 @dataclass(frozen=True)
 class TurnedFormat:
-    """Of a camera that is mounted on its side or upside down."""
+    """Images of a camera that is mounted on its side or upside down, turned upright."""
 
     inner: ImageFormat
-    """As the camera sends them."""
+    """The format in which the camera sends them."""
     clockwise_deg: Literal[90, 180, 270]
 
     def check(self, data: bytes) -> None:
@@ -179,23 +177,23 @@ class TurnedFormat:
         self.inner.check(data)
 
     def pixels(self, data: bytes) -> UInt8Array:
-        """See ``ImageFormat``: up is up."""
+        """See ``ImageFormat``: turned upright."""
         return turned(self.inner.pixels(data), self.clockwise_deg)
 
     def decode(self, data: bytes) -> UInt8Array:
-        """See ``ImageFormat``: up is up."""
+        """See ``ImageFormat``: turned upright."""
         return turned(self.inner.decode(data), self.clockwise_deg)
 
 
 class SharedImage:
-    """One image of several cameras: decoded once, when the first of them is asked for."""
+    """One image of several cameras; decoded once, when the first part is needed."""
 
     def __init__(self, image_format: ImageFormat) -> None:
         self._format = image_format
         self._pixels: UInt8Array | None = None
 
     def decoder(self, camera: CameraDeviceParameters) -> Decoder:
-        """Of a camera's part, a view of the whole unless it is turned."""
+        """The decoder of a camera's part; it returns a view of the whole image unless the part is turned."""
         return partial(self._part, camera)
 
     def _part(self, camera: CameraDeviceParameters, data: bytes) -> UInt8Array:
@@ -207,28 +205,28 @@ class SharedImage:
 
 
 def turned(image: UInt8Array, clockwise_deg: Literal[0, 90, 180, 270]) -> UInt8Array:
-    """The image as it is seen when it is turned so."""
+    """The image turned clockwise."""
     return np.asarray(cv2.rotate(image, _TURNS[clockwise_deg]), np.uint8) if clockwise_deg else image
 
 
 def check_length(data: bytes, length: int) -> None:
-    """Raises CorruptImageError for another length."""
+    """Raises CorruptImageError if the data have another length."""
     if len(data) != length:
         raise CorruptImageError(f"{len(data)} bytes instead of {length}")
 
 
 def plausible(image: UInt8Array) -> UInt8Array:
-    """The same image; raises CorruptImageError for what decodes without complaint and yet shows too little."""
+    """The same image. Raises CorruptImageError if it is of one colour, or if its last rows are."""
     sample = image[::_SAMPLE_STRIDE, ::_SAMPLE_STRIDE]
     if float(sample.std(axis=(0, 1)).max()) < _FLAT_DEVIATION:
         raise CorruptImageError("image is all of one colour")
     strip = image[-max(image.shape[0] // _LOST_SHARE, 1) :, ::_SAMPLE_STRIDE]
     low, high = _SATURATED
     if np.all(strip == strip[0, 0]) and np.any((strip[0, 0] > low) & (strip[0, 0] < high)):
-        raise CorruptImageError("image stops short of its last rows")
+        raise CorruptImageError("the image's last rows are missing")
     return image
 
 
 def up_to(multiple: int, number: int) -> int:
-    """The least multiple that is not below the number."""
+    """The smallest multiple that is at least ``number``."""
     return -(-number // multiple) * multiple

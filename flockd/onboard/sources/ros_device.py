@@ -1,4 +1,4 @@
-"""One camera behind topics of ROS 2: Image or CompressedImage with CameraInfo, fetched by a process of its own."""
+"""A camera on topics of ROS 2, Image or CompressedImage with CameraInfo, read in a separate process."""
 
 from __future__ import annotations
 
@@ -24,15 +24,16 @@ ENCODINGS: Mapping[str, str] = {
     "yuv422": "UYVY",
     "uyvy": "UYVY",
 }
-"""What is read of `sensor_msgs/image_encodings`, by GStreamer's name."""
+"""GStreamer's name for each encoding of `sensor_msgs/image_encodings` that can be decoded."""
 CENTRE_PX = 0.5
 """ROS and its tools have pixel centres at whole numbers, flockd at +0.5."""
 LENS_TOLERANCE = 0.03
-"""By so much of the focal length a driver's CameraInfo and the rig may be apart: two calibrations of one camera are."""
+"""Largest difference between a driver's CameraInfo and the rig, as a share of the focal length: two calibrations of
+one camera differ."""
 
 
 def info_topic_of(topic: str) -> str:
-    """Where a camera's CameraInfo is by the ecosystem's custom: beside the images, whatever transport carries them."""
+    """The topic of a camera's CameraInfo by the convention of ROS: beside the images, whatever their transport."""
     base = topic.removesuffix("/compressed")
     return f"{base.rpartition('/')[0]}/camera_info"
 
@@ -44,9 +45,10 @@ def ros_format(
     wanted: tuple[int, int],
     size_words: tuple[str, str],
 ) -> ImageFormat:
-    """Of a message's images, which have to be of the size ``wanted``. Raises ValueError for those that cannot be read.
+    """The format of a message's image. Raises ValueError if it cannot be decoded or is not of the size ``wanted``.
 
-    ``encoding``: of an Image; of a CompressedImage, whose ``size`` is None, its `format`. ``size_words``: its camera's.
+    ``encoding``: of an Image, or the `format` of a CompressedImage, whose ``size`` is None. ``size_words``: see
+    `CameraDeviceParameters.size_words`.
     """
     if size is None:
         if "compressedDepth" not in encoding and ("jpeg" in encoding or "jpg" in encoding):
@@ -64,7 +66,7 @@ def ros_format(
 def info_fault(
     lens: IntrinsicsConfig, wanted: tuple[int, int], size: tuple[int, int], found: tuple[float, float, float, float]
 ) -> str | None:
-    """What of a CameraInfo contradicts the rig: its ``size``, or fx, fy, cx and cy. One without a calibration does not.
+    """How a CameraInfo contradicts the rig, by its ``size`` or fx, fy, cx and cy; None: it agrees, or is uncalibrated.
 
     Pixel centres are at whole numbers in ROS.
     """
@@ -81,7 +83,7 @@ def info_fault(
 
 
 class RosDevice(ChildDevice):
-    """A ``CameraDevice`` of a topic. Its time stamps are the messages' own, carried over to CLOCK_MONOTONIC."""
+    """A ``CameraDevice`` for a topic. Time stamps are those of the messages, converted to CLOCK_MONOTONIC."""
 
     _what, _kinds = "its topic", (IMAGE, COMPRESSED, INFO)
 
@@ -92,7 +94,7 @@ class RosDevice(ChildDevice):
         lens: IntrinsicsConfig | None = None,
         command: Sequence[str] = ROS_CHILD,
     ) -> None:
-        """Starts the process; ``lens``: of the rig, which a CameraInfo must not contradict. Raises CameraError."""
+        """Starts the process. ``lens``: the rig's intrinsics, which CameraInfo must agree with. Raises CameraError."""
         self._topic, self._lens = camera.place, lens
         self._info_topic = camera.camera_info or info_topic_of(camera.place)
         super().__init__(camera, size, [*command, "ros", camera.place, self._info_topic, camera.stamps])
@@ -111,7 +113,7 @@ class RosDevice(ChildDevice):
         return self._captured(message.data[IMAGE_HEAD.size :], message)
 
     def _compare(self, width: int, height: int, fx: float, fy: float, cx: float, cy: float) -> None:
-        """Raises CameraError where a CameraInfo says something else than the rig. One without a calibration may."""
+        """Raises CameraError if a calibrated CameraInfo contradicts the rig."""
         if self._lens is None:
             return
         fault = info_fault(self._lens, self._size, (width, height), (fx, fy, cx, cy))

@@ -1,8 +1,8 @@
-"""Frames from another program on this computer through zenoh's shared memory, and the side that publishes them.
+"""Frames from another program on this computer through zenoh's shared memory: the source, and a publisher.
 
-A frame is one message under `flockd-frames/v1/<drone>/<camera>`: its payload is the image, row by row, 3 bytes RGB a
-pixel; its attachment says what it is in 24 bytes, little-endian: `rgb8`, width and height (uint16), sequence (uint64),
-time in seconds (float64). Zenoh carries it through shared memory, and through the socket where that cannot be had.
+A frame is one message under `flockd-frames/v1/<drone>/<camera>`. Its payload is the image, row by row, 3 bytes RGB per
+pixel. Its attachment has 24 bytes, little-endian: `rgb8`, width and height (uint16), sequence (uint64), time in seconds
+(float64). Without shared memory zenoh sends it through a socket.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from flockd.onboard.sources.image_formats import RgbFormat
 from flockd.onboard.telemetry.zenoh_session import SessionError, SessionOwner, close_session, open_session
 
 PREFIX = "flockd-frames/v1"
-"""Apart from telemetry, which no drone reads."""
+"""Not below telemetry's keys: no drone reads telemetry."""
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7448"
 _HEADER = struct.Struct("<4sHHQd")
 _MAGIC = b"rgb8"
 
 
 class FramePublisher(SessionOwner):
-    """Publishes the frames of any number of drones; what a simulator calls. Raises UnavailableError without endpoint.
+    """Publishes the frames of any number of drones, for simulators. Raises UnavailableError for an unusable endpoint.
 
-    Nothing waits for a reader: a frame that nobody can take in time is dropped on the way.
+    It never waits: a frame is dropped if its reader is too slow.
     """
 
     def __init__(self, *, listen: Sequence[str] = (DEFAULT_ENDPOINT,)) -> None:
@@ -57,7 +57,7 @@ class FramePublisher(SessionOwner):
 
 
 class SharedMemorySource(FrameReceiver):
-    """A ``FrameSource`` of what a ``FramePublisher`` publishes for one drone."""
+    """A ``FrameSource`` for the frames that a ``FramePublisher`` publishes for one drone."""
 
     def __init__(
         self,
@@ -74,7 +74,7 @@ class SharedMemorySource(FrameReceiver):
         self._subscribers: list[zenoh.Subscriber[None]] = []
 
     def start(self) -> None:
-        """See ``FrameSource``; raises UnavailableError for an endpoint that cannot be one."""
+        """See ``FrameSource``. Raises UnavailableError for an invalid endpoint."""
         self._session = _open(listen=(), connect=self._where.connect)
         self._subscribers = [
             self._session.declare_subscriber(
@@ -90,7 +90,7 @@ class SharedMemorySource(FrameReceiver):
             close_session(self._session)
 
     def _receive(self, camera: str, sample: zenoh.Sample) -> None:
-        """On a thread of zenoh's."""
+        """Called on a thread of zenoh's."""
         image_format = self._formats[camera]
         try:
             header = b"" if sample.attachment is None else sample.attachment.to_bytes()
@@ -106,14 +106,14 @@ class SharedMemorySource(FrameReceiver):
             self.refuse(camera, "corrupt", why)
             return
         if not self.is_of_now(time_s, services.FRAME_STAMP.timeout):
-            why = f"{camera}: a time stamp is not of this computer's clock; correct the program"
+            why = f"{camera}: a time stamp is not on this computer's clock; correct the program that sends it"
             self.refuse(camera, "time_stamp", why)
             return
         self.offer(RawFrame(camera, sample.payload.to_bytes(), image_format.decode, time_s, sequence))
 
 
 def _open(*, listen: Sequence[str], connect: Sequence[str]) -> zenoh.Session:
-    """Without shared memory where this computer gives none."""
+    """Opens a session, with shared memory if this computer has it."""
     with suppress(SessionError):
         return open_session("frames", listen, connect, shared_memory=True)
     return open_session("frames", listen, connect, shared_memory=False)

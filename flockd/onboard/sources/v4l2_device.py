@@ -1,4 +1,4 @@
-"""One V4L2 camera through the kernel's own interface (linux/videodev2.h): ioctl, mmap and poll, on 64-bit Linux.
+"""A V4L2 camera through the kernel's interface (linux/videodev2.h): ioctl, mmap and poll, on 64-bit Linux.
 
 Frames have the kernel's time stamps and numbers.
 """
@@ -36,14 +36,14 @@ _RATE_TOLERANCE = 0.1
 
 
 class V4l2Device(CameraDevice):
-    """A ``CameraDevice`` of the kernel's."""
+    """A ``CameraDevice`` for a V4L2 camera."""
 
     start_s = 3.0
 
     def __init__(self, camera: CameraDeviceParameters, size: tuple[int, int], kernel: Kernel | None = None) -> None:
-        """Opens the device, sets it up as asked, and starts it; what the driver does not grant is a CameraError.
+        """Opens, sets up and starts the device. Raises CameraError if the driver does not grant a setting.
 
-        ``size`` is the image's as it is used: width and height, reduced, and of a camera on its side turned.
+        ``size``: width and height of the images as used, after `reduce` and `turn_deg`.
         """
         self._kernel = kernel or Kernel()
         self._who = f"{camera.name}: {camera.device}"
@@ -67,7 +67,7 @@ class V4l2Device(CameraDevice):
             raise
 
     def read(self, timeout_s: float) -> CapturedBuffer | None:
-        """The next image; None if there is none within the time."""
+        """See ``CameraDevice``."""
         with self._telling("has failed"):
             if not self._kernel.wait(self._descriptor, timeout_s):
                 return None
@@ -96,8 +96,8 @@ class V4l2Device(CameraDevice):
         return sent if self._turn_deg == 0 else TurnedFormat(sent, self._turn_deg)
 
     def close(self) -> None:
-        """Stops the camera and gives it back."""
-        with contextlib.suppress(OSError):  # an unplugged camera cannot be stopped any more
+        """See ``CameraDevice``."""
+        with contextlib.suppress(OSError):  # an unplugged camera cannot be stopped
             self._kernel.ioctl(self._descriptor, v4l2.VIDIOC_STREAMOFF, ctypes.c_int(CAPTURE))
         while self._maps:
             self._maps.pop().close()
@@ -168,7 +168,8 @@ class V4l2Device(CameraDevice):
             self._kernel.ioctl(self._descriptor, v4l2.VIDIOC_G_CTRL, granted)
         if granted.value != wanted.value:
             raise CameraError(
-                f"{self._who} makes {granted.value} of {wanted.name} {wanted.value}; write a value it can keep"
+                f"{self._who} sets {wanted.name} to {granted.value} instead of {wanted.value}; "
+                "write a value that it keeps"
             )
 
     def _start(self) -> None:
@@ -202,7 +203,7 @@ class V4l2Device(CameraDevice):
 
 
 def camera_flags(capability: v4l2.Capability) -> int:
-    """What this device can do; not what the whole camera can, which may have several."""
+    """The capabilities of this device; a camera may have several devices."""
     known = capability.capabilities & _HAS_DEVICE_CAPABILITIES
     return int(capability.device_caps if known else capability.capabilities)
 

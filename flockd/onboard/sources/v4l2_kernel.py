@@ -28,7 +28,7 @@ class Capability(ctypes.Structure):
 
 
 class Format(ctypes.Structure):
-    """struct v4l2_format with its v4l2_pix_format; the union it sits in is 200 bytes long and aligned to 8."""
+    """struct v4l2_format with its v4l2_pix_format, in a union of 200 bytes that is aligned to 8."""
 
     _fields_: ClassVar = [
         *_words("type padding width height pixelformat field bytesperline sizeimage"),
@@ -46,7 +46,7 @@ class StreamParameters(ctypes.Structure):
 
 
 class RequestBuffers(ctypes.Structure):
-    """struct v4l2_requestbuffers; the last word is its flags and what is reserved."""
+    """struct v4l2_requestbuffers; the last word holds flags and reserved bytes."""
 
     _fields_: ClassVar = _words("count type memory capabilities flags")
 
@@ -94,13 +94,13 @@ class FormatDescription(ctypes.Structure):
 
 
 class FrameSize(ctypes.Structure):
-    """struct v4l2_frmsizeenum; of a range of sizes the first two numbers are the smallest and the largest width."""
+    """struct v4l2_frmsizeenum; for a range of sizes the first two numbers are the smallest and the largest width."""
 
     _fields_: ClassVar = [*_words("index pixel_format type width height"), ("rest", ctypes.c_uint32 * 6)]
 
 
 class FrameInterval(ctypes.Structure):
-    """struct v4l2_frmivalenum; of a range the shortest interval."""
+    """struct v4l2_frmivalenum; for a range the shortest interval."""
 
     _fields_: ClassVar = [
         *_words("index pixel_format width height type numerator denominator"),
@@ -134,14 +134,14 @@ VIDIOC_ENUM_FRAMEINTERVALS = _request(75, FrameInterval, _READ | _WRITE)
 
 
 class Kernel:
-    """The system calls of Linux that a camera is driven by; each raises OSError as the kernel does."""
+    """The system calls that drive a camera. Each may raise OSError."""
 
     def open(self, path: str) -> int:
         """A file descriptor for reading and writing that never blocks."""
         return os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
 
     def close(self, descriptor: int) -> None:
-        """Ends the descriptor."""
+        """Closes the descriptor."""
         os.close(descriptor)
 
     def ioctl(self, descriptor: int, request: int, argument: ctypes.Structure | ctypes.c_int) -> None:
@@ -152,11 +152,11 @@ class Kernel:
                 return
 
     def map(self, descriptor: int, length: int, offset: int) -> mmap.mmap:
-        """Maps a buffer of the driver, which holds the device open until that is closed."""
+        """Maps a buffer of the driver; the device stays open until the map is closed."""
         return mmap.mmap(descriptor, length, mmap.MAP_SHARED, mmap.PROT_READ | mmap.PROT_WRITE, offset=offset)
 
     def wait(self, descriptor: int, timeout_s: float) -> bool:
-        """Whether there is something to fetch, a frame or an error, within the time."""
+        """Whether a frame or an error can be read within the time."""
         poll = select.poll()
         poll.register(descriptor, select.POLLIN)
         return bool(poll.poll(timeout_s * 1000.0))

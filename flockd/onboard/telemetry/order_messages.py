@@ -48,7 +48,7 @@ def parse_order(command: str, message: Mapping[str, object] | None) -> MissionOr
         raise ValueError(f"{command} has no key {unknown[0]!r}; its keys are {', '.join(sorted(allowed))}")
     order: OrderMessage = from_json(OrderMessage, dict(message))
     if None in (*order.values(), *order.get("velocity_ne", ())):
-        raise ValueError(f"what {command} says has to be numbers")
+        raise ValueError(f"the values of {command} have to be numbers")
     height_m, speed_m_s = order.get("height_m"), order.get("speed_m_s")
     if command == "velocity":
         velocity = order.get("velocity_ne", [])

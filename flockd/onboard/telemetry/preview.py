@@ -1,4 +1,4 @@
-"""Small JPEGs of the cameras' images, with detections and tracks, for telemetry; and the boxes, for any image."""
+"""Small JPEGs of the cameras' images with detections and tracks for telemetry, and their boxes for any image."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from flockd.flight.geometry import Rig, RigCamera
 LARGEST_SIDE_PX = 320
 JPEG_QUALITY = 70
 EVERY_S = 0.2
-"""Shortest time between two pictures of a camera, however many watchers ask."""
+"""Shortest time between two pictures of a camera, whatever the number of watchers."""
 FRESH_S = services.PREVIEW.timeout
 """While the pilot steps, the newest step's frames are shown if they are at most this much older than the newest."""
 _COLOURS = ((255, 109, 0), (0, 176, 255), (213, 0, 249), (0, 200, 83), (255, 214, 0), (255, 23, 68))
-"""RGB, of one track after the other."""
+"""RGB of tracks, by their numbers."""
 _WHITE = (255, 255, 255)
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
@@ -30,7 +30,7 @@ Step = tuple[FrameSet, VehicleState, PilotOutput]
 
 
 class Previews:
-    """Pictures on request, on the caller's thread: the pilot never waits for one."""
+    """Draws pictures on request, on the caller's thread: the pilot never waits."""
 
     def __init__(
         self,
@@ -69,8 +69,8 @@ class Previews:
 def preview(frame: Frame, camera: RigCamera | None = None, step: Step | None = None) -> bytes:
     """A JPEG of the frame, at most 320 pixels wide and high.
 
-    With a step a box is around each detection in it, with its range and the number of its track, `?` before that is
-    confirmed. A circle shows where a confirmed track is expected that was not detected in this step.
+    With a step, each detection has a box with its range and the number of its track, with `?` until it is confirmed. A
+    circle shows the expected position of a confirmed track that was not detected in this step.
     """
     height, width = frame.image.shape[:2]
     scale = min(1.0, LARGEST_SIDE_PX / max(height, width))
@@ -83,7 +83,7 @@ def preview(frame: Frame, camera: RigCamera | None = None, step: Step | None = N
 
 
 def _draw(image: UInt8Array, camera: RigCamera, step: Step, scale: float) -> None:
-    """Detections and tracks whose middle is in this camera's image."""
+    """Draws detections and tracks whose centre is in this camera's image."""
     _, vehicle, output = step
     tracks = {one.track: one for one in output.neighbours if one.confirmed}
     for one in tracks.values():
@@ -102,19 +102,19 @@ def _draw(image: UInt8Array, camera: RigCamera, step: Step, scale: float) -> Non
 
 
 def colour_of(number: int) -> tuple[int, int, int]:
-    """RGB of a track, or of a detection where there are no tracks."""
+    """RGB for the number of a track, or of a detection if there are no tracks."""
     return _COLOURS[number % len(_COLOURS)]
 
 
 def draw_box(image: UInt8Array, box: Sequence[float], colour: tuple[int, int, int], thick: int = 1) -> None:
-    """Around a box, left, top, right and bottom in pixels, not over what is in it."""
+    """Draws a frame around a box (left, top, right, bottom, in pixels) without covering its content."""
     left, top = (int(np.floor(value)) - thick for value in box[:2])
     right, bottom = (int(np.ceil(value)) + thick - 1 for value in box[2:])
     cv2.rectangle(image, (left, top), (right, bottom), colour, thick)
 
 
 def write_at(image: UInt8Array, box: Sequence[float], text: str, colour: tuple[int, int, int], thick: int = 1) -> None:
-    """Below a box, or above it where the image ends; on a dark ground, to be read on any background."""
+    """Writes a label below a box, or above it at the image's lower edge, on a dark background."""
     scale, (height, width) = 0.42 * thick, image.shape[:2]
     (wide, high), _ = cv2.getTextSize(text, _FONT, scale, thick)
     left, below = int(np.clip(box[0], 0, max(width - wide, 0))), int(box[3]) + 3 * thick

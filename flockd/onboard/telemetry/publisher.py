@@ -76,7 +76,7 @@ class ZenohTelemetry(SessionOwner):
             self.lost += 1
 
     def show_alive(self, drone: str) -> None:
-        """Publishes that a drone is alive while this session exists, and its clocks; without a daemon to ask."""
+        """Publishes that a drone is alive while this session exists, and replies to queries for its clocks."""
         key = f"{self._prefix}/{checked_name(drone)}"
         self._keep(
             drone,

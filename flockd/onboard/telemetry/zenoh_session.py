@@ -107,7 +107,7 @@ def read_settings(file: Path) -> zenoh.Config:
 
 
 def _reason(error: zenoh.ZError) -> str:
-    """In a line."""
+    """Zenoh's error in one short line."""
     words = " ".join(str(error).split(" at ")[0].split(": [")[0].split())
     return words if len(words) <= MOST_REASON else f"{words[:MOST_REASON]}..."
 

@@ -104,14 +104,14 @@ def test_what_is_worth_nothing_is_dropped_and_counted_and_the_next_is_fine(
 @pytest.mark.parametrize(
     ("pipeline", "told"),
     [
-        ("caps:64x48 2 end", "its pipeline has ended; a camera's goes on for ever"),
+        ("caps:64x48 2 end", "its pipeline has ended; use one that does not end"),
         ("fail:has_failed_(Device_is_gone)", "its pipeline has failed (Device is gone); try it with `gst-launch-1.0 "),
         ("fail:GStreamer_is_not_installed", "GStreamer is not installed; install libgstreamer1.0-0, gstreamer1.0-"),
         ("caps:32x24", "its pipeline gives 32x24, but the rig has 64x48; end it with `videoscale ! video/x-raw,width="),
         ("caps:video/x-h264,_width=(int)64,_height=(int)48", "its pipeline gives video/x-h264, width=(int)64, heigh"),
         ("crash", "the process of its pipeline was ended by SIGSEGV; a driver may have crashed"),
-        ("print", "the process of its pipeline sent what is no image; something in it prints"),
-        ("2", "the process of its pipeline sent what is no image; something in it prints"),
+        ("print", "the process of its pipeline sent no image but other data; stop the element or driver that prints"),
+        ("2", "the process of its pipeline sent no image but other data; stop the element or driver that prints"),
     ],
 )
 def test_each_way_to_fail_is_one_sentence_and_is_tried_again(start: Watch, pipeline: str, told: str) -> None:

@@ -47,7 +47,7 @@ def test_a_jpeg_may_leave_out_the_tables_that_all_cameras_share_and_be_padded() 
         (lambda data: data[:2] + data[-2:], "JPEG has no size"),
         (lambda data: data[:200] + b"\xff\xd9", "JPEG has|JPEG cannot be decoded"),
         (lambda data: jpeg(scene()[::2, ::2]), "JPEG has 320x240 instead of 640x480"),
-        (lambda data: data[: len(data) // 2] + b"\xff\xd9", "image stops short of its last rows"),
+        (lambda data: data[: len(data) // 2] + b"\xff\xd9", "the image's last rows are missing"),
         (lambda data: jpeg(np.full((480, 640, 3), 128, np.uint8)), "all of one colour"),
     ],
 )
