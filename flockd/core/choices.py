@@ -8,45 +8,45 @@ from __future__ import annotations
 from typing import Literal, get_args
 
 Role = Literal["flow", "depth", "segmentation", "detector", "distance", "verification"]
-"""What a network is used for: optical flow of two images, depth of one, pixels of drones in one, boxes of drones in
-one, range of the drone in a crop, and whether there is a drone in a crop."""
+"""Roles of networks: optical flow; depth, pixels and boxes of drones; range of the drone in a crop; is there a
+drone."""
 ROLES: tuple[Role, ...] = get_args(Role)
-"""Those that a simulator can fill with the truth. True segments need no boxes, and the true distance also tells whether
+"""Roles that a simulator can fill with the truth. True segments need no boxes, and the true distance also shows whether
 there is a drone."""
 
 Provider = Literal["cpu", "cuda", "tensorrt", "openvino"]
-"""What computes the networks: execution providers of ONNX Runtime, or OpenVINO."""
+"""Providers that compute networks: those of ONNX Runtime, or OpenVINO."""
 
 FlowRefinement = Literal["lucas_kanade", "dis", "none"]
-"""What sharpens a network's flow."""
+"""The method that refines a network's flow."""
 
 ScaleSource = Literal["network", "height"]
-"""Where the metric scale of the background comes from."""
+"""The source of the background's metric scale."""
 
 HeightSource = Literal["range_finder", "barometer", "best"]
-"""What measures the height above ground that fixes the background's scale."""
+"""The source of the height above ground for this scale."""
 
 OwnVelocitySource = Literal["vision", "autopilot"]
-"""Whose estimate of its own velocity a drone flies by."""
+"""The source of a drone's own velocity."""
 
 LensModel = Literal["pinhole", "wide_angle"]
 """A camera's projection: with OpenCV's radial-tangential distortion, or equidistant (Kannala-Brandt)."""
 LENS_MODELS: tuple[LensModel, ...] = get_args(LensModel)
 
 PixelFormat = Literal["mjpeg", "yuyv"]
-"""What a V4L2 camera delivers."""
+"""Pixel formats of V4L2 cameras."""
 
 ImageFormat = Literal["png", "jpeg"]
-"""How the images of a recording are compressed."""
+"""Compression of a recording's images."""
 
 AutopilotMode = Literal["hold", "return", "land"]
-"""What flockd may ask the autopilot to do instead of following it."""
+"""Modes that flockd may request from the autopilot."""
 
 SimulatedPerception = Literal["learned", "truth"]
 """Whether a simulated drone flies by its networks or by the simulator's state."""
 
 CameraPreset = Literal["ideal", "realistic"]
-"""How good a simulated drone's cameras are."""
+"""Quality of a simulated drone's cameras."""
 
 AutopilotKind = Literal["fake", "px4"]
-"""Which autopilot a simulated fleet flies with."""
+"""The autopilot of a simulated fleet."""

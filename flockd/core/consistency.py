@@ -1,8 +1,8 @@
-"""Every check of one sensor against another: what is compared, how far apart it may be, and what is done. One table.
+"""The table of all checks of one sensor against another: the values compared, the limit, and the reaction.
 
-As an extended Kalman filter's innovation checks do it: what one source says is compared with what the others lead to
-expect, and beyond the limit it is not used. The configuration's keys take their defaults from here, and all layers
-their other limits. Times and ages of messages stand in `services`.
+They work like the innovation checks of a Kalman filter: a value of one source is compared with its expectation from the
+others, and is not used beyond the limit. Configuration keys take their defaults from here, code its other limits. Times
+and ages of messages are in `services`.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ class Check(NamedTuple):
     unit: str
     """`SD`: standard deviations of what is expected."""
     reaction: str
-    """Beyond it: an event of the supervisor's, whose table says what is done, or a text."""
+    """Reaction beyond the limit: an event of the supervisor, whose table gives the reaction, or a text."""
     source: str
-    """Where the limit comes from."""
+    """Source of the limit."""
     keys: tuple[str, ...] = ()
     """Configuration keys whose default `limit` is."""
 

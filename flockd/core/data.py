@@ -1,4 +1,4 @@
-"""Files: those that come with flockd, and how one is written."""
+"""Paths of the files that come with flockd, and atomic writing of a file."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from flockd.core.errors import UnavailableError
 
 
 def data_path(folder: Literal["config", "models", "systemd"]) -> Path:
-    """The folder of that name: inside an installed package, beside the package in a checkout.
+    """The folder of that name, inside an installed package or beside the package in a checkout.
 
-    Raises UnavailableError when it is in neither.
+    Raises UnavailableError if it is in neither.
     """
     package = Path(__file__).parents[1]
     for candidate in (package / "_data" / folder, package.parent / folder):
@@ -25,9 +25,9 @@ def data_path(folder: Literal["config", "models", "systemd"]) -> Path:
 
 @contextmanager
 def written_whole(target: Path) -> Iterator[Path]:
-    """A place to write to, which becomes the target when all is written and vanishes otherwise.
+    """A temporary path to write to. It is renamed to the target at the end, and deleted after an error.
 
-    Its name ends like the target's, by which writers choose a format. If nothing is written the target stays.
+    Its name ends like the target's, because writers choose a format by it. If no file was written, the target stays.
     """
     draft = target.with_name(f".{target.stem}.{uuid.uuid4().hex[:8]}.part{target.suffix}")
     try:

@@ -9,7 +9,7 @@ from enum import IntEnum
 
 
 class ExitCode(IntEnum):
-    """What a command's exit status means; 69 and 78 are the numbers of sysexits.h, 130 the shell's of Ctrl-C."""
+    """Exit codes of commands; 69 and 78 are those of sysexits.h, 130 is the shell's for Ctrl-C."""
 
     DONE = 0
     CHECK_FAILED = 1
@@ -20,19 +20,19 @@ class ExitCode(IntEnum):
 
 
 class FlockdError(Exception):
-    """An error that a person can correct; the text says all, one sentence a line."""
+    """An error that a person can correct. Its text is complete: one sentence a line."""
 
     exit_code = ExitCode.CHECK_FAILED
 
 
 class UsageError(FlockdError):
-    """The command line asks for something that cannot be."""
+    """The command line is invalid."""
 
     exit_code = ExitCode.USAGE
 
 
 class UnavailableError(FlockdError):
-    """Something outside is not there: an extra that is not installed, a device, a service."""
+    """A resource is missing: an extra that is not installed, a device, a service."""
 
     exit_code = ExitCode.UNAVAILABLE
 
@@ -45,11 +45,11 @@ class ModelError(FlockdError):
 
 @dataclass(frozen=True, order=True)
 class ConfigProblem:
-    """One thing wrong with a configuration: where, what, and what to do."""
+    """One fault of a configuration: its place, the fault, and the remedy."""
 
     file: str
     line: int
-    """Counted from 1; 0 where no line is to blame (a missing file, an override)."""
+    """Counted from 1; 0: no line is at fault (a missing file, an override)."""
     key: str
     """Path inside the file, as in `rig.cameras[0].size_px`; empty for the file as a whole."""
     message: str
@@ -63,7 +63,7 @@ MAX_PROBLEMS_TOLD = 20
 
 
 class ConfigError(FlockdError):
-    """Everything wrong with a configuration at once; its text has one line for each of the first problems."""
+    """All faults of a configuration; the text has one line for each of the first problems."""
 
     exit_code = ExitCode.BAD_CONFIGURATION
 
@@ -96,11 +96,11 @@ _SHORTAGE_TEXTS = {
     "can't start new thread": "threads or memory",
     "resource temporarily unavailable": "threads or memory",
 }
-"""By what libraries say, in lower case, that have no error of their own for it."""
+"""By texts of libraries, in lower case, that raise no error type for it."""
 
 
 def shortage_of(error: BaseException) -> str | None:
-    """What the process or the computer has run out of, by the error that this led to; None for any other error."""
+    """The resource that ran out, by the error that it caused; None: another error."""
     if isinstance(error, BaseExceptionGroup):
         return next(filter(None, map(shortage_of, error.exceptions)), None)
     if isinstance(error, MemoryError):

@@ -1,4 +1,4 @@
-"""Commands, keys and values of earlier versions that this one lacks: for each, what to use instead."""
+"""Removed commands, keys and values of earlier versions, each with its replacement."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ COMMANDS: Mapping[str, str] = {
     "flockd record recover": "leave it out: what is whole of a recording is read",
     "flockd view": "open the recording in Foxglove, or in Rerun after `rerun mcap convert RECORDING.mcap -o X.rrd`",
 }
-"""By a command, or a command and its option, as they were written on the command line."""
+"""Replacements by command, or command and option, as written on the command line."""
 
 KEYS: Mapping[str, str] = {
     "autopilot.arm_and_take_off": "leave it out: a pilot or a ground station arms, takes off and selects offboard",

@@ -1,16 +1,15 @@
-"""What a JPEG would cost to decode, from its bytes, before memory or time is spent on its pixels."""
+"""Checks a JPEG's header before decoding: whether its pixels would take too much memory or time."""
 
 from __future__ import annotations
 
 import re
 
 MAX_IMAGE_PIXELS = 1 << 26
-"""8192 x 8192: more than any camera of a drone has. The command line tells OpenCV so, which refuses what has more."""
+"""8192 x 8192: more than any drone's camera has. The command line also sets it as OpenCV's limit."""
 MAX_SCANS = 100
-"""Of a JPEG: encoders write 10 or so, and libjpeg-turbo's own tools call more than 500 an attack."""
+"""Scans of a JPEG: encoders write about 10, and libjpeg-turbo's tools treat more than 500 as an attack."""
 MAX_SCANNED_PIXELS = 1 << 30
-"""Pixels times scans: each scan of a progressive JPEG goes over all pixels, however few bytes it has. A second or
-two."""
+"""Pixels times scans, a second or two: each scan of a progressive JPEG visits all pixels, however few bytes it has."""
 _STANDALONE = frozenset({0x01, *range(0xD0, 0xD8)})
 _FRAME_HEADERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _SCAN, _END = 0xDA, 0xD9
@@ -18,7 +17,7 @@ _JPEG = b"\xff\xd8"
 
 
 def cost_fault(data: bytes) -> str | None:
-    """Why a JPEG is not to be decoded, as it would take too much memory or time; None: it may be, or is none."""
+    """Why decoding a JPEG would take too much memory or time; None: it would not, or the data are no JPEG."""
     width, height = jpeg_size(data) or (0, 0)
     if width * height > MAX_IMAGE_PIXELS:
         return f"claims to be {width} x {height} pixels, more than any camera has"
@@ -29,13 +28,13 @@ def cost_fault(data: bytes) -> str | None:
 
 
 _AFTER_SCAN = re.compile(rb"\xff+[^\x00\xd0-\xd7\xff]")
-"""A marker that ends the data of a scan: a byte of data that is 0xff has a zero behind it."""
+"""A marker that ends a scan's data; in the data, a zero follows each byte 0xff."""
 
 
 def jpeg_end(data: bytes) -> int | None:
-    """Where the JPEG at the beginning ends, behind its end marker; None where it has none, or is no JPEG.
+    """Index behind the end marker of the JPEG at the beginning; None: it has no end marker, or the data are no JPEG.
 
-    What thumbnails and whatever follows hold does not count.
+    Markers inside thumbnails, or behind the JPEG, do not count.
     """
     at = 2 if data.startswith(_JPEG) else len(data)
     while at + 2 <= len(data) and data[at] == 0xFF:
@@ -53,7 +52,7 @@ def jpeg_end(data: bytes) -> int | None:
 
 
 def jpeg_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height of the frame header; None for what is no JPEG, or has none before the first scan."""
+    """Width and height in the frame header; None: the data are no JPEG, or have no header before the first scan."""
     at = 2 if data.startswith(_JPEG) else len(data)
     while at + 9 <= len(data) and data[at] == 0xFF:
         marker = data[at + 1]

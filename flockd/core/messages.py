@@ -37,27 +37,27 @@ Matrix3 = Annotated[FloatArray, Shape((3, 3))]
 
 
 class ReasonKind(StrEnum):
-    """What a reason says is missing from a step."""
+    """The part of a step that is missing."""
 
     INPUT = "input"
-    """All of it: the frames or the vehicle state cannot be right."""
+    """The whole step: frames or vehicle state are impossible."""
     HEIGHT = "height"
-    """The height's wanted source."""
+    """The configured source of the height."""
     CAMERA = "camera"
-    """A camera's image, or part of what perception makes of it."""
+    """A camera's image, or a part of its perception."""
     LENS = "lens"
-    """A camera's image, as its lens shows too little."""
+    """A camera's image, because its lens is covered or dirty."""
     PAIR = "pair"
     """The pair of frame sets."""
     PROPOSAL = "proposal"
-    """A region that may show a drone."""
+    """A proposal."""
     EGO_MOTION = "ego_motion"
     NEIGHBOUR = "neighbour"
     """A neighbour, or its motion."""
     RIG = "rig"
-    """A camera's image, as it moves otherwise than the drone."""
+    """A camera's image, because it does not move as the drone does."""
     RECORDED = "recorded"
-    """Unknown: recordings keep the text alone."""
+    """Not known: recordings only have the text."""
 
 
 @dataclass(frozen=True)
@@ -73,8 +73,8 @@ class Reason:
 
 
 UNCLASSED = 255
-"""Label of pixels that are not to be used: too near a drone's outline to be sure of, or a drone's that is not detected.
-Other labels are 0 for the background, then one value a drone."""
+"""Label of pixels that are not used: near a drone's outline, or on a drone that is not detected. The label of the
+background is 0; each drone has its own value above 0."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,44 +98,44 @@ class FrameSet:
 
 @dataclass(frozen=True, eq=False)
 class RangeReading:
-    """How far a range finder that faces down says the ground is."""
+    """A reading of a range finder that faces down."""
 
     time_s: float
-    """When it was measured, on the clock of `VehicleState`."""
+    """Time of the measurement, on the clock of `VehicleState`."""
     range_m: float
     """Along the body's down axis."""
     min_m: float | None = None
-    """Nearer than this the sensor measures nothing; None: not known."""
+    """Shortest range of the sensor; None: not known."""
     max_m: float | None = None
-    """Farther than this, likewise."""
+    """Longest range of the sensor; None: not known."""
     quality: float | None = None
-    """Quality of the signal, 0 (none) to 1; None: the sensor does not say."""
+    """Signal quality from 0 (no signal) to 1; None: the sensor does not report it."""
 
 
 @dataclass(frozen=True, eq=False)
 class VehicleState:
-    """What the drone's own autopilot says of itself. Nothing in here comes from another drone."""
+    """The state by the drone's own autopilot. It contains no data of other drones."""
 
     time_s: float
     R_ned_body: Matrix3
     """(3, 3) attitude."""
     height_m: float
-    """Height above home from the barometer, metres, up positive: above the ground where that is level."""
+    """Height above home from the barometer, metres, up positive; on level ground the height above ground."""
     velocity_ned: Vector3 | None = None
-    """(3,) m/s, the autopilot's own estimate, where it has one."""
+    """(3,) m/s NED, the autopilot's estimate; None: it has none."""
     position: Vector2 | None = None
-    """(2,) metres north and east of home, the autopilot's own estimate, where it has one."""
+    """(2,) metres north and east of home, the autopilot's estimate; None: it has none."""
     home_deg: Vector2 | None = None
-    """(2,) latitude and longitude of home, where the autopilot knows it."""
+    """(2,) latitude and longitude of home; None: the autopilot does not know it."""
     ground_range: RangeReading | None = None
-    """The newest of the range finder that faces down, however old or bad; None: none was heard."""
+    """The newest reading of the range finder that faces down, whatever its age and quality; None: no reading yet."""
     turn_rate: Vector3 | None = None
-    """(3,) rad/s about the body axes, where it is known."""
+    """(3,) rad/s about the body axes; None: not known."""
 
 
 @dataclass(frozen=True, eq=False)
 class GroundEstimate:
-    """The ground below the drone, as a plane: what fixed the metric scale of depth."""
+    """The ground below the drone as a plane, from which the metric scale of depth follows."""
 
     height_m: float
     """Height of the body's origin above the ground straight below."""
@@ -147,7 +147,7 @@ class GroundEstimate:
 
 @dataclass(frozen=True, eq=False)
 class MissionOrder:
-    """What an operator asks of one drone's mission: a goal, in metres or in degrees, or a velocity."""
+    """An operator's order to one drone's mission: a goal, in metres or in degrees, or a velocity."""
 
     place: Vector2 | None = None
     """(2,) metres north and east of the mission's origin."""
@@ -156,36 +156,36 @@ class MissionOrder:
     velocity: Vector2 | None = None
     """(2,) m/s, north and east."""
     height_m: float | None = None
-    """Above the ground at home; None: as before."""
+    """Height above the ground at home; None: unchanged."""
     speed_m_s: float | None = None
-    """On the way to the goal; None: the mission's."""
+    """Speed on the way to the goal; None: the mission's."""
 
 
 @dataclass(frozen=True, eq=False)
 class MissionStatus:
-    """How far a drone is with its mission."""
+    """Progress of a drone's mission."""
 
     kind: str
     desired: Vector2
-    """(2,) m/s: W_i efv of Eq. 42, less flocking's own weight."""
+    """(2,) m/s: W_i efv of Eq. 42, without `flocking.own_weight`."""
     sentence: str
-    """What it does now, for people."""
+    """What the drone does now, for people."""
     goal: Vector2 | None = None
-    """(2,) metres north and east of home: where it flies to; None: nowhere in particular."""
+    """(2,) metres north and east of home: its goal; None: it has no goal."""
     goal_height_m: float | None = None
     arrived: bool = False
     """At the last goal."""
     takeover: str | None = None
-    """`land` or `return`: what the autopilot is to be asked for, as the mission is over; None: nothing."""
+    """Mode to request from the autopilot at the end of the mission, `land` or `return`; None: no request."""
 
     @property
     def known(self) -> bool:
-        """Whether a mission has reported it."""
+        """Whether a mission has reported this status."""
         return self.kind != NO_STATUS.kind
 
 
 NO_STATUS = MissionStatus("unknown", np.zeros(2), "has not begun")
-"""Before a pilot's first good step, of one that was not stepped, and in recordings that do not hold the circle's."""
+"""The status before a pilot's first valid step, and in recordings that do not contain the circle's."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,7 +203,7 @@ class EgoMotion:
     pairs: int
     inliers: int
     threshold_m: float
-    """The rejection threshold at which Algorithm 1 found its inliers."""
+    """Threshold at which Algorithm 1 found its inliers."""
 
     @property
     def velocity(self) -> FloatArray:
@@ -215,7 +215,7 @@ class EgoMotion:
 class Detection:
     """One drone detected in one frame set, before tracking, in log-polar coordinates: a bearing and a log range.
 
-    Cameras err in these independently: in direction by an angle, in range by a share of it.
+    In these coordinates a camera's errors are independent: an angle of the direction, and a share of the range.
     """
 
     bearing: Vector3
@@ -223,18 +223,18 @@ class Detection:
     log_range: float
     """Natural logarithm of the range in metres."""
     covariance: Matrix3
-    """(3, 3) in body axes, of what `flockd.flight.geometry.log_polar_residual` measures: along the bearing the
-    variance of the log range, if the size is right; across it that of the angle, rad^2."""
+    """(3, 3) in body axes, for the residual of `flockd.flight.geometry.log_polar_residual`: along the bearing the
+    variance of the log range at a known size, across it that of the angle, rad^2."""
     drone_probability: float
-    """Probability that it is a drone at all."""
+    """Probability that it is a drone."""
     size_m: float
-    """An estimate of the drone's own size, constant over time: its range times its angular size."""
+    """Estimated size of the drone, tip to tip, m: its range times its angular size."""
     cameras: tuple[str, ...]
-    """More than one where the drone straddles an image border."""
+    """Cameras that show it; more than one at the border of two images."""
     label: int
-    """Its value in the masks of this frame set, from 1 up."""
+    """Its label in the masks of this frame set, from 1 up."""
     log_size_sigma: float = 0.0
-    """Standard deviation of the logarithm of `size_m`: the log range has the same error, alike in all of a drone's."""
+    """Standard deviation of the logarithm of `size_m`. All log ranges of a drone have the same error."""
 
     @property
     def range_m(self) -> float:
@@ -253,7 +253,7 @@ class Detection:
 
     @property
     def way_sigma_m(self) -> float:
-        """The same if the size is right: of the distance that the drone flew between two detections of it."""
+        """The same without the error of the size, which cancels in the distance flown between two detections."""
         return self.range_m * math.sqrt(float(self.bearing @ self.covariance @ self.bearing))
 
 
@@ -265,26 +265,26 @@ Sectors = Annotated[FloatArray, Shape((SECTORS,))]
 
 @dataclass(frozen=True, eq=False)
 class ObstacleRanges:
-    """Nearest obstacle in each of n equal sectors around the drone, level, over the heights that the drone needs.
+    """Nearest obstacle in each of n equal horizontal sectors around the drone, within its band of heights.
 
     Sector k is centred on the azimuth 2 pi k / n, clockwise from north.
     """
 
     time_s: float
     range_m: Sectors
-    """(n,) metres, level, from the drone's centre; inf where nothing was seen within `seen_m`."""
+    """(n,) metres, horizontal, from the drone's centre; inf: no obstacle within `seen_m`."""
     sigma_m: Sectors
-    """(n,) metres: standard deviation of `range_m`; 0 where that is inf."""
+    """(n,) metres: standard deviation of `range_m`; 0 if that is inf."""
     seen_m: Sectors
-    """(n,) metres: how far the sector is known to be free or measured; 0 where it was not looked at."""
+    """(n,) metres: range up to which the sector is known to be free or measured; 0: not observed."""
 
 
 @dataclass(frozen=True, eq=False)
 class PossibleMotion:
-    """One of the ways in which a neighbour may move, by its detections."""
+    """A possible motion of a neighbour."""
 
     probability: float
-    """That it is the true one; those of a neighbour add up to 1."""
+    """Probability that it is the true one; those of a neighbour add up to 1."""
     position: Vector3
     velocity: Vector3
     """As of `Neighbour`."""
@@ -308,34 +308,34 @@ class Neighbour:
     age_s: float
     """Since first seen."""
     unseen_s: float
-    """Since last seen; 0 when seen in the newest frame set."""
+    """Time since it was last detected; 0: in the newest frame set."""
     hits: int
     confirmed: bool
     existence_probability: float = 1.0
-    """Probability that it is a drone and still there; 1 in recordings from before it was estimated."""
+    """Probability that it is a drone and still there; 1 in recordings of versions that did not estimate it."""
     possible: tuple[PossibleMotion, ...] | None = None
-    """The motions that it may have, the likeliest first; the position and velocity above are their mean. None: one, as
+    """Its possible motions, the likeliest first; the position and velocity above are their mean. None: only the motion
     above."""
 
 
 @dataclass(frozen=True, eq=False)
 class Wanted:
-    """What the pilot asks for: the flock law's velocity, which is level, and the mission's height and heading.
+    """The velocity, height and heading that the pilot wants, by flocking law and mission.
 
-    Only the gate turns it into what is allowed, a `Setpoint`.
+    Only the gate converts it to a `Setpoint`.
     """
 
     velocity: Vector2
-    """(2,) m/s, north and east: the law's after limits, and the trim."""
+    """(2,) m/s, north and east: the law's velocity after limits, plus `trim`."""
     acceleration: Vector2
-    """(2,) m/s^2, north and east: u of Eq. 38 after limits; where a neighbour or an obstacle changed the velocity, the
-    acceleration that leads to that in a step."""
+    """(2,) m/s^2, north and east: u of Eq. 38 after limits. If passing or avoidance changed the velocity, the
+    acceleration that reaches it in a step."""
     yaw_rad: float | None
-    """Heading, clockwise from north, `wrapped`; None: as it is, while no good attitude is known."""
+    """Heading, clockwise from north, `wrapped`; None: unchanged, because no valid attitude is known."""
     trim: Vector2 | None = None
-    """(2,) m/s, north and east: what of the velocity corrects the autopilot's own estimate; None: nothing."""
+    """(2,) m/s, north and east: the part of `velocity` that corrects the autopilot's estimate; None: zero."""
     height_m: float | None = None
-    """As in `VehicleState`, up positive: the height that the mission wants; None: the one that the flight began at."""
+    """Height of the mission, as in `VehicleState`, up positive; None: the height at which the flight began."""
 
     def __post_init__(self) -> None:
         if self.yaw_rad is not None:
@@ -344,7 +344,7 @@ class Wanted:
 
 @dataclass(frozen=True, eq=False)
 class Setpoint:
-    """What the gate allows: fly this horizontal velocity, hold this height, face this way. Nothing else makes one."""
+    """The permitted horizontal velocity, height and heading. Only the gate makes setpoints."""
 
     time_s: float
     """When it was decided."""
@@ -361,19 +361,19 @@ class Setpoint:
 
 @dataclass(frozen=True)
 class SizeStatus:
-    """What the drone has learned in flight of how large its neighbours are."""
+    """The size of the neighbours that the drone has learned in flight."""
 
     weaves: bool
-    """Whether it moves up and down now, to learn it."""
+    """Whether the drone weaves up and down now to learn it."""
     size_m: float | None = None
-    """From tip to tip, from which ranges follow; None: not known well enough."""
+    """Size from tip to tip that ranges use; None: not known well enough."""
     sigma: float | None = None
     """Relative standard deviation of `size_m`."""
 
 
 @dataclass(frozen=True)
 class LearnedSize:
-    """How large a pilot found the others to be, for the pilot of the flight that follows."""
+    """The size of the others that a pilot learned, for the pilot of the next flight."""
 
     size_m: float
     """From tip to tip."""
@@ -383,33 +383,33 @@ class LearnedSize:
 
 @dataclass(frozen=True, eq=False)
 class PilotOutput:
-    """Everything one step of the pilot found and decided."""
+    """All results of one step of the pilot."""
 
     time_s: float
     ego_motion: EgoMotion | None
     velocity: Vector3 | None
-    """(3,) m/s NED: the own velocity that the law used; None before there is one."""
+    """(3,) m/s NED: the own velocity that the law used; None: not known yet."""
     detections: tuple[Detection, ...]
     detection_tracks: tuple[int, ...]
-    """The track that each detection went to."""
+    """Track number of each detection."""
     neighbours: tuple[Neighbour, ...]
     command: Wanted
     reasons: tuple[Reason, ...] = ()
-    """Why something is missing; recorded as their texts."""
+    """Reasons for missing parts; recordings contain their texts."""
     counts: Mapping[str, int] = field(default_factory=dict)
     """Estimates refused in this step, by the reason's text."""
     stages_ms: Mapping[str, float] = field(default_factory=dict)
-    """Time each stage took, as measured by the caller's clock; empty without one."""
+    """Duration of each stage by the caller's stopwatch; empty without one."""
     mission: MissionStatus = NO_STATUS
-    """As of the last good step."""
+    """As of the last valid step."""
     noisy_cameras: tuple[str, ...] = ()
-    """Cameras whose images were not used: noise, damage, a lens that shows too little, another motion than the
-    drone's."""
+    """Cameras whose images were not used: noise, damage, a covered lens, or a motion that differs from the drone's."""
     ground: GroundEstimate | None = None
-    """From the range finder, or the barometer in its place; None: no range finder is wanted, or there is no scale."""
+    """From the range finder, or the barometer in its place; None: no range finder is configured, or no scale is
+    known."""
     obstacles: ObstacleRanges | None = None
-    """The local map; None where obstacles are not looked for."""
+    """The local map; None: obstacles are not detected."""
     seen_m: Sectors | None = None
-    """(n,) metres: that of the local map, always: how far cameras looked lately; None: of a simulation without any."""
+    """(n,) metres: the local map's `seen_m`, even without obstacle detection; None: a simulation without cameras."""
     size: SizeStatus | None = None
-    """None while nothing is learned of the neighbours' size."""
+    """None: no size is learned."""

@@ -1,4 +1,4 @@
-"""Angles modulo a turn, places within a polygon, and how many metres a degree of the WGS 84 ellipsoid is."""
+"""Angles modulo a turn, points within a polygon, and lengths of degrees on the WGS 84 ellipsoid."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ SQUARED_ECCENTRICITY = 6.694379990e-3
 
 
 def wrapped(angle_rad: float) -> float:
-    """The same direction in (-pi, pi]; an angle in there stays as it is. NaN where it is not finite."""
+    """The same direction in (-pi, pi]; an angle in that interval is unchanged. NaN for angles that are not finite."""
     if not math.isfinite(angle_rad):
         return math.nan
     turned_rad = math.remainder(angle_rad, math.tau)
@@ -27,7 +27,7 @@ def is_inside(corners: Sequence[tuple[float, float]], north_m: float, east_m: fl
 
 
 def crosses_itself(corners: Sequence[tuple[float, float]]) -> bool:
-    """Whether two sides of the closed outline through the corners cross, other than where one follows the other."""
+    """Whether two sides of the closed outline through the corners cross; neighbouring sides may share a corner."""
 
     def left(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]) -> bool:
         return (b[0] - a[0]) * (c[1] - a[1]) > (b[1] - a[1]) * (c[0] - a[0])
@@ -41,7 +41,7 @@ def crosses_itself(corners: Sequence[tuple[float, float]]) -> bool:
 
 
 def metres_a_degree(latitude_deg: float) -> tuple[float, float]:
-    """Metres in a degree of latitude and of longitude."""
+    """Metres per degree of latitude and per degree of longitude."""
     latitude = math.radians(latitude_deg)
     flattened = 1.0 - SQUARED_ECCENTRICITY * math.sin(latitude) ** 2
     north = math.radians(EQUATOR_M * (1.0 - SQUARED_ECCENTRICITY) / flattened**1.5)
@@ -50,12 +50,12 @@ def metres_a_degree(latitude_deg: float) -> tuple[float, float]:
 
 
 def metres_from(home_deg: Sequence[float], place_deg: Sequence[float]) -> tuple[float, float]:
-    """How far north and east one place, latitude and longitude, is of another, on a plane there: correct to a few
-    metres within 10 km, to centimetres within 1 km."""
+    """Metres north and east from one place to another, both latitude and longitude, on a plane: correct to a few metres
+    within 10 km, to centimetres within 1 km."""
     north_m, east_m = metres_a_degree((place_deg[0] + home_deg[0]) / 2)
     return (place_deg[0] - home_deg[0]) * north_m, degrees_apart(place_deg[1], home_deg[1]) * east_m
 
 
 def degrees_apart(longitude_deg: float, other_deg: float) -> float:
-    """How far east one longitude is of another, the shorter way around the Earth: from -180 to 180."""
+    """Degrees from one longitude east to another, the shorter way around the Earth: from -180 to 180."""
     return (longitude_deg - other_deg + 180.0) % 360.0 - 180.0

@@ -1,17 +1,17 @@
-"""Texts from outside, made fit for a terminal: what would steer it is written as an escape instead."""
+"""Makes texts from outside safe for a terminal: control characters are written as escapes."""
 
 from __future__ import annotations
 
 import unicodedata
 
 _STEERING = frozenset({"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"})
-"""Unicode categories of what is not shown but acted on: control codes, changes of direction, surrogates, line ends."""
+"""Unicode categories of characters that are escaped: control codes, changes of direction, surrogates, line ends."""
 
 
 def printable(text: str, *, lines: bool = True) -> str:
     r"""The text with ``\u001b`` for an escape character, and so on, which is also how JSON writes it.
 
-    ``lines``: line feeds and tabs stay.
+    ``lines``: line feeds and tabs are kept.
     """
     kept = "\n\t" if lines else ""
     if text.isprintable():

@@ -1,4 +1,4 @@
-"""Passwords in what a configuration says: where they stand, and the same without them."""
+"""Finds and masks passwords in a configuration's texts."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ MASK = "***"
 _OF_URL = re.compile(r"(?<=://)[^\s\"']*(?=@)")
 """A user and a password before the host: `rtsp://user:password@camera/stream`."""
 _QUERY = re.compile(r"\?[^\s\"']+")
-"""Of an address. Each of its values is masked, as every maker calls a password otherwise: `pwd`, `loginpas`, `auth`."""
+"""The query of an address. All its values are masked, because makers name a password `pwd`, `loginpas` or `auth`."""
 _VALUE = re.compile(r"(?<=[?&;])([^&;=]*=)?[^&;]+")
 _NAMED = re.compile(
     r"([\w-]*(?:passw|passphrase|-pw|pwd|secret|token|key|auth|credential|cookies|extra-headers)[\w-]*\s*=\s*)"
@@ -20,7 +20,7 @@ _NAMED = re.compile(
 
 
 def masked(value: Any) -> Any:
-    """The same with `***` for each password: of a text, or of the texts in lists and objects."""
+    """A text, or the texts in lists and objects, with `***` for each password."""
     if isinstance(value, str):
         without = _QUERY.sub(lambda query: _VALUE.sub(rf"\1{MASK}", query[0]), _OF_URL.sub(MASK, value))
         return _NAMED.sub(rf"\1{MASK}", without)

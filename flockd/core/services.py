@@ -1,7 +1,6 @@
-"""Every message whose age counts: its rate, its time-out, and what is done when it is older. The one table.
+"""The table of all messages whose age matters: rate, time-out, and the reaction to an older message.
 
-The configuration's keys take their defaults from here, and all layers their other limits. After openpilot's
-`cereal/services.py`.
+Configuration keys take their defaults from here, code its other limits. After openpilot's `cereal/services.py`.
 """
 
 from __future__ import annotations
@@ -10,22 +9,22 @@ from typing import Literal, NamedTuple
 
 
 class Service(NamedTuple):
-    """One message as one of its readers expects it."""
+    """One message, as one of its readers expects it."""
 
     message: str
     rate_hz: float
-    """Expected, with the configuration's defaults."""
+    """Expected rate with the configuration's defaults."""
     timeout: float
     """In `unit`."""
     reaction: str
-    """To a message that is older or missing: an event of the supervisor's, whose table says what is done, or a text."""
+    """Reaction to an older or missing message: an event, whose reaction is in the supervisor's table, or a text."""
     keys: tuple[str, ...] = ()
     """Configuration keys whose default `timeout` is."""
     unit: Literal["s", "periods"] = "s"
 
     @property
     def period_s(self) -> float:
-        """At the expected rate."""
+        """Period at the expected rate."""
         return 1.0 / self.rate_hz
 
 

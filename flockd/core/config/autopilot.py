@@ -1,4 +1,4 @@
-"""The link to the autopilot, and what may be asked of it."""
+"""The link to the autopilot, and the requests that flockd may make."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from flockd.core.config.base import Distance, Port, Section, Share, Speed, text
 
 
 def _baud(address: str) -> str:
-    """Raises ValueError for a baud rate that no serial port has."""
+    """Raises ValueError if no serial port has this baud rate."""
     baud = address.rpartition(":")[2]
     rates = [name[1:] for name in dir(termios) if re.fullmatch(r"B[1-9]\d*", name)]
     if address.startswith("serial:") and baud not in rates:
@@ -23,7 +23,7 @@ def _baud(address: str) -> str:
 
 
 class AutopilotParameters(Section):
-    """How flockd reaches this drone's autopilot, and what it may ask of it."""
+    """The link to this drone's autopilot, and the requests that flockd may make."""
 
     address: Annotated[
         str,
@@ -36,23 +36,23 @@ class AutopilotParameters(Section):
     ] = "udpin://127.0.0.1:14540"
     """`udpin://` waits for an autopilot that sends to this address; `serial:///dev/ttyS1:921600` is a cable."""
     system_id: Annotated[int, Field(ge=1, le=255)] | None = None
-    """The autopilot's MAV_SYS_ID, another one for each drone of the fleet; other systems are ignored. By default that
-    of the only autopilot on the link: two are refused."""
+    """The autopilot's MAV_SYS_ID, different for each drone of the fleet; flockd ignores other systems. By default that
+    of the only autopilot on the link; flockd refuses to start if there are two."""
     setpoint_rate_hz: Annotated[float, Field(ge=5, le=50)] = services.SETPOINT.rate_hz
     max_setpoint_age_s: Annotated[float, Field(gt=0, le=10)] = services.REQUEST.timeout
     """An older setpoint is not sent."""
     max_control_age_s: Annotated[float, Field(gt=0, le=0.4)] = services.CONTROL.timeout
-    """Nothing is sent when the control loop has not run for this long."""
+    """No setpoint is sent if the control loop has not run for this long."""
     max_gap_s: Annotated[float, Field(gt=0, le=0.9)] = services.SETPOINT.timeout
-    """A longer gap between setpoints in offboard flight, or a longer silence of the autopilot, ends the stream until it
-    is begun anew. Keep it below PX4's COM_OF_LOSS_T: PX4 returns to offboard by itself when setpoints come back."""
+    """A longer gap between setpoints in offboard flight, or a longer silence of the autopilot, ends the stream for this
+    flight. Keep it below PX4's COM_OF_LOSS_T, because PX4 returns to offboard by itself when setpoints come back."""
     on_failure: Literal["hold", "land"] = "hold"
-    """The mode that flockd requests from the autopilot when it cannot go on."""
+    """The mode that flockd requests from the autopilot when it cannot fly on."""
     height_m: Distance | None = None
     """Height above home to fly at; by default the height at which the flight begins."""
     max_velocity_trim_m_s: Speed = 0.5
-    """Setpoints are corrected by up to this where the autopilot's velocity and the cameras' differ: an autopilot flies
-    by its own estimate, which errs by 0.1 to 0.3 m/s with GNSS alone. 0: no correction. No effect with `own_velocity:
-    autopilot`."""
+    """Limit of the correction of setpoints by the difference between the cameras' velocity and the autopilot's: the
+    autopilot flies by its own estimate, which errs by 0.1 to 0.3 m/s with GNSS alone. 0: no correction. No effect with
+    `own_velocity: autopilot`."""
     low_battery_share: Share = 0.2
-    """The battery counts as low when the autopilot reports this share or less."""
+    """Share of the charge at or below which the battery counts as low."""

@@ -1,4 +1,4 @@
-"""Obstacles: how they are kept in mind, and how the drone flies around them."""
+"""Obstacles: the local map, and avoidance."""
 
 from __future__ import annotations
 
@@ -13,29 +13,28 @@ _Seconds = Annotated[float, Field(gt=0, le=60)]
 
 
 class ObstacleParameters(Section):
-    """Parameters for the local map and for avoidance; braking and reaction are those of `safety.gate`."""
+    """Parameters of the local map and of avoidance; braking and reaction times are those of `safety.gate`."""
 
     enabled: bool = False
-    """Whether obstacles are looked for and avoided. Without it trees and walls are seen, but not flown around."""
+    """Whether obstacles are detected and avoided."""
     range_m: _Metres = 15.0
-    """Obstacles beyond this do not count, and cameras are taken to see no farther, whether obstacles are avoided or
-    not."""
+    """Range of obstacle detection. The gate always assumes that cameras see this far."""
     height_band_m: _Metres = 0.75
-    """Obstacles more than this above or below the drone do not count: room for its rotors and for errors in height."""
+    """Obstacles farther above or below the drone are ignored. The band covers rotors and errors of height."""
     below_m: _Metres = 1.5
-    """Instead, downwards, if it is more: a tree's top may be too thin to be seen, lower down it is wider."""
+    """The limit below the drone, if larger: lower down, trees are wide enough to be detected."""
     range_sigma: Annotated[float, Field(gt=0, le=1)] = 0.1
-    """Standard deviation of a range from the depth map, as a share of it."""
+    """Standard deviation of a range from the depth map, as a share of the range."""
     min_pixels: Annotated[int, Field(ge=1, le=10_000)] = 4
-    """Pixels of a sector that have to show an obstacle, of every fourth of each row and column."""
+    """Least number of pixels that show an obstacle in a sector; every fourth pixel of each row and column is used."""
     memory_s: _Seconds = 3.0
-    """How long the map keeps what is no longer seen: an obstacle, and that a direction was empty."""
+    """Time for which the map keeps obstacles and free directions that are no longer in view."""
     clearance_m: Annotated[float, Field(gt=0, le=20)] = 0.9
-    """From the drone's middle to an obstacle's surface: nearer than this, it flies away from it."""
+    """Distance of the drone's centre from an obstacle's surface below which it flies away from the obstacle."""
     margin_m: Annotated[float, Field(ge=0, le=20)] = 0.5
-    """Added to the clearance where there is room."""
+    """Added to the clearance if there is room."""
     horizon_s: _Seconds = 3.0
-    """A direction is free where nothing is met within this time, at the wanted speed; with neighbours near, at theirs
-    or 1.5 m/s at most."""
+    """A direction is free if the drone meets no obstacle within this time at the wanted speed; among neighbours at most
+    at 1.5 m/s, or at theirs if that is faster."""
     sigmas: Annotated[float, Field(ge=0, le=10)] = 2.0
-    """An obstacle counts as nearer than measured by this many standard deviations."""
+    """Number of standard deviations by which an obstacle is assumed nearer than measured."""

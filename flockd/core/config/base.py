@@ -1,4 +1,4 @@
-"""What every section of the configuration is made of: strict values with units, limits and finite numbers."""
+"""Building blocks of the configuration's sections: strict values with units and limits, and finite numbers."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
 Duration = Annotated[float, Field(gt=0, le=3600)]
-"""Seconds; an hour is longer than any of these flights."""
+"""Seconds; no flight lasts an hour."""
 Distance = Annotated[float, Field(gt=0, le=10_000)]
-"""Metres; farther than any of these radios and cameras reach."""
+"""Metres; beyond the range of radios and cameras."""
 Speed = Annotated[float, Field(ge=0, le=50)]
-"""m/s; faster than any of these vehicles."""
+"""m/s; faster than any vehicle."""
 FARTHEST_M = 100_000.0
 FromHome = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M)]
 """Metres north or east of home, or of a mission's origin."""
@@ -25,12 +25,12 @@ Vector3 = tuple[float, float, float]
 
 
 def text(pattern: str, words: str) -> Any:
-    """The field of a text that has to match; ``words`` describe it for people: what it is, then a comma."""
+    """The field of a text that has to match a pattern. ``words`` describe it for people: its meaning, then a comma."""
     return Field(pattern=pattern, json_schema_extra={WORDS: words})
 
 
 WORDS = "words"
-"""The key of a JSON schema that holds what `text` was given."""
+"""The key of a JSON schema that holds the words given to `text`."""
 Name = Annotated[
     str,
     text(
@@ -42,7 +42,7 @@ PlainName = Annotated[str, text(r"^[a-z0-9_-]+$", "a name, of small letters, dig
 
 
 def checked_port(address: str) -> str:
-    """Raises ValueError for a number that is no network port, or 0, which is any."""
+    """Raises ValueError for a number that is no network port, and for 0, which means any port."""
     kind, _, rest = address.partition("/")
     port = re.search(r":(\d+)(?:[?#].*)?$", rest)
     if port and kind.rstrip(":") in _WITH_PORTS and not 0 < int(port[1]) <= 65535:
@@ -52,7 +52,7 @@ def checked_port(address: str) -> str:
 
 _WITH_PORTS = {"tcp", "udp", "tls", "quic", "ws", "udpin", "udpout", "tcpin", "tcpout"}
 Port = AfterValidator(checked_port)
-"""Of a text with an address at its end."""
+"""The port of a text that ends with an address."""
 Endpoint = Annotated[
     str,
     Port,
@@ -72,9 +72,9 @@ class Section(BaseModel):
 
 
 def refuse(model: BaseModel, faults: Mapping[tuple[str | int, ...], str]) -> None:
-    """Raises the validation error that has these messages at these keys of the section; does nothing without messages.
+    """Raises a validation error with these messages at these keys of the section; does nothing without messages.
 
-    For the validators of a section: a ValueError of theirs would be reported for the section as a whole.
+    For validators of a section, whose ValueError would be reported for the whole section.
     """
     if faults:
         details = [

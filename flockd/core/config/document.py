@@ -1,8 +1,8 @@
-"""Turns one YAML file into plain values, each with its place, reading every scalar as a person would.
+"""Reads one YAML file into plain values, each with its place in the file.
 
 Scalars follow the core schema of YAML 1.2 (section 10.3.2), not YAML 1.1: `on` and `no` are words, `010` is ten, `1e3`
-is a number, `12:30` is a word. What invites mistakes in a configuration (a key given twice, anchors, tags, several
-documents) is refused.
+is a number, `12:30` is a word. Duplicate keys, anchors, tags and several documents are refused, because they invite
+mistakes.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ Value = str | int | float | bool | None | tuple["Value", ...] | dict[str, "Value
 MAX_BYTES = 1 << 20
 MAX_DEPTH = 32
 MAX_VALUES = 30_000
-"""A hundred times the values of our largest file; reading more takes longer than anyone would wait for an error."""
+"""A hundred times the values of flockd's largest file; more would take too long to read."""
 LARGEST_INT = 2**63 - 1
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where a value stands, and how it was written."""
+    """The place of a value in the file, and its text."""
 
     file: str
     line: int
@@ -44,7 +44,7 @@ class Place:
 
 @dataclass
 class Document:
-    """One file's values, the place of each, and what was wrong with the YAML itself."""
+    """The values of one file, their places, and the faults of the YAML itself."""
 
     file: str
     values: dict[str, Value] = field(default_factory=dict)
@@ -57,10 +57,10 @@ _CALIBRATION = re.compile(r"^(%YAML:1|camera_matrix:|[ \t]+camera_model:)", re.M
 
 
 def read_document(path: Path, what: str = "configuration") -> Document:
-    """The values of one YAML file; ``what`` it is, for the messages.
+    """Reads one YAML file; ``what`` names its kind in messages.
 
-    Raises ConfigError with one problem when nothing can be read from it (missing, not text, not YAML, not a mapping);
-    lesser faults are listed in the document's `problems`.
+    Raises ConfigError with one problem if the file cannot be read at all (missing, not text, not YAML, not a mapping).
+    Other faults are listed in `Document.problems`.
     """
     text = _read_text(path, what)
     if _CALIBRATION.search(text):
@@ -87,7 +87,7 @@ def read_document(path: Path, what: str = "configuration") -> Document:
 
 
 def key_text(path: KeyPath) -> str:
-    """A path as a person writes it: `rig.cameras[0].name`."""
+    """A path in the form `rig.cameras[0].name`."""
     text = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in path)
     return text.removeprefix(".")
 
@@ -119,7 +119,7 @@ def _read_text(path: Path, what: str) -> str:
 
 
 class _Loader(yaml.SafeLoader):
-    """Composes nodes; refuses what invites mistakes, and what is endless before it is read through."""
+    """Composes nodes; refuses constructs that invite mistakes, and stops early at documents that are too large."""
 
     def __init__(self, text: str, file: str, what: str) -> None:
         super().__init__(text)
@@ -156,7 +156,7 @@ class _Loader(yaml.SafeLoader):
 
 
 def _value(document: Document, node: yaml.Node, path: KeyPath, line: int) -> Value:
-    """What a node holds; its place is the line of its key or its item."""
+    """The value of a node; its place is the line of its key or item."""
 
     def complain(message: str, at: KeyPath = path, line: int = line) -> None:
         document.problems.append(ConfigProblem(document.file, line, key_text(at), message))
@@ -223,7 +223,7 @@ _GLUED_KEY = re.compile(r"[\s-]*\w+:[^\s:]+\s*")
 
 
 def _syntax_problem(file: str, text: str, error: yaml.MarkedYAMLError) -> ConfigProblem:
-    """The parser's error as a message that says what to do."""
+    """The parser's error as a message with the remedy."""
     mark = error.problem_mark or error.context_mark
     assert mark is not None
     lines = [*text.split("\n"), ""]

@@ -28,24 +28,24 @@ from flockd.core.secrets import masked
 
 
 class RecordingConfig(Section):
-    """How a flight is recorded, where it is recorded at all."""
+    """How a flight is recorded, if it is recorded."""
 
     images: ImageFormat = "png"
-    """`png` loses nothing: only then does a replay equal the flight."""
+    """Only `png` is lossless, so that a replay equals the flight."""
     jpeg_quality: Annotated[int, Field(ge=1, le=100)] = 90
     queue_mb: Positive = 64.0
-    """Memory for what waits for the disk; beyond it steps are dropped."""
+    """Memory for data that wait for the disk; when it is full, steps are dropped."""
     quota_mb: Positive = 20000.0
-    """Limit for all recordings of the drone in one folder together: the oldest are deleted to make room, also on a full
-    disk. The previous flight's does not count, and is deleted last, on a full disk only. A flight that exceeds the
-    limit alone is recorded up to it."""
+    """Limit for all recordings of the drone in one folder. The oldest are deleted to make room, also on a full disk.
+    The previous flight's recording does not count; it is deleted last, and on a full disk only. A flight that exceeds
+    the limit alone is recorded up to it."""
 
 
 OperatorCommand = Literal["hold", "land", "resume", "goto", "velocity"]
 
 
 class TelemetryParameters(Section):
-    """Who may watch this drone, and what they may command."""
+    """Endpoints at which this drone can be watched, and the commands that it accepts."""
 
     fleet: Name = "fleet"
     listen: tuple[Endpoint, ...] = ("tcp/127.0.0.1:7447",)
@@ -53,11 +53,11 @@ class TelemetryParameters(Section):
     connect: tuple[Endpoint, ...] = ()
     """zenoh endpoints, of a router or of `flockd status --listen`, that this drone keeps trying to reach."""
     zenoh_config: str | None = None
-    """A file of zenoh's own settings to begin with, for TLS and access control; see `config/zenoh_tls.json5`. A
-    relative path counts from the folder of the configuration file."""
+    """A file of zenoh's settings, for TLS and access control; see `config/zenoh_tls.json5`. A relative path starts at
+    the folder of the configuration file."""
     commands: tuple[OperatorCommand, ...] = ()
-    """Commands that operators may send over telemetry; by default none. `goto` and `velocity` change the drone's
-    mission until the flight ends."""
+    """Commands that operators may send over telemetry; by default no command. `goto` and `velocity` change the mission
+    until the flight ends."""
 
     @model_validator(mode="after")
     def _endpoints_differ(self) -> Self:
@@ -69,14 +69,14 @@ class TelemetryParameters(Section):
 
 
 class DroneConfig(Section):
-    """Everything one drone's pilot needs."""
+    """The configuration of one drone."""
 
     name: Name = "drone"
     """Its name in telemetry and recordings; different for each drone of a fleet."""
     step_s: Annotated[float, Field(gt=0, le=60)] = 0.5
     rig: RigConfig
     source: SourceParameters | None = None
-    """Where the frames come from; needed to fly, not to simulate."""
+    """The source of camera frames; required to fly, not to simulate."""
     perception: PerceptionConfig = PerceptionConfig()
     geometry: GeometryParameters = GeometryParameters()
     tracking: TrackingParameters = TrackingParameters()
@@ -89,12 +89,12 @@ class DroneConfig(Section):
     """Heading: kept as it is, or along the desired velocity."""
     recording: RecordingConfig = RecordingConfig()
     autopilot: AutopilotParameters | None = None
-    """Without it this drone's commands go to the simulator only."""
+    """The link to the autopilot; required to fly, not to simulate."""
     telemetry: TelemetryParameters = TelemetryParameters()
 
     @property
     def speed_factor(self) -> float:
-        """How fast this drone's time passes: 1 unless it is simulated."""
+        """Speed of this drone's time relative to real time: 1 unless it is simulated."""
         return 1.0 if self.source is None else self.source.shared_memory.speed_factor
 
     @model_validator(mode="after")
@@ -136,7 +136,7 @@ class DroneConfig(Section):
         return self
 
     def _late_steps(self) -> dict[tuple[str | int, ...], str]:
-        """Where steps are so far apart that each, or one that is late, would stop the drone."""
+        """Faults of a `step_s` so long that each step, or one that is late, would stop the drone."""
         fresh_s, lasts_s = self.safety.gate.command_fresh_s, self.safety.estimate_timeout_s
         if self.step_s > fresh_s:
             told = f"safety.gate.command_fresh_s {fresh_s:g}, so that the drone would slow down before each step"
@@ -147,7 +147,7 @@ class DroneConfig(Section):
         return {("step_s",): f"{self.step_s:g} s is above {told}; write a smaller one, or a larger time there"}
 
     def _device_faults(self, cameras: Sequence[CameraDeviceParameters]) -> dict[tuple[str | int, ...], str]:
-        """Where the cameras of the rig do not match the names and crops of their devices."""
+        """Faults where the cameras of the rig do not match the names and crops of their devices."""
         rig = {camera.name: camera.size_px for camera in self.rig.cameras}
         devices = [camera.name for camera in cameras]
         faults: dict[tuple[str | int, ...], str] = {}

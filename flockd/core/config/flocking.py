@@ -13,9 +13,9 @@ class WeightParameters(Section):
     """The influence weight W of Eq. 39 and 40."""
 
     kind: Literal["uniform", "nearest"] = "nearest"
-    """`nearest`: 1 for the nearest neighbours, 0 for the others; `uniform`: 1 for all: more than ten drones crowd."""
+    """`nearest`: 1 for the nearest neighbours, 0 for others. `uniform`: 1 for all; above ten drones flocks contract."""
     nearest: Annotated[int, Field(ge=1)] = 6
-    """With kind `nearest`: how many neighbours. For seven drones or fewer, 6 equals `uniform`."""
+    """For kind `nearest`: the number of neighbours. In flocks of up to seven drones, 6 equals `uniform`."""
 
 
 class FlockingParameters(Section):
@@ -37,13 +37,13 @@ class FlockingParameters(Section):
     """D_II"""
     weight: WeightParameters = WeightParameters()
     cohesion_time_s: Duration | None = 5.0
-    """Time after which a neighbour may pull with `max_acceleration_m_s2`; before, the limit grows with the square of
-    the time for which it has been seen. False neighbours are mostly seen for a few seconds, and far away, where Eq. 39
-    pulls most. null: no limit, as in the paper. docs/concepts/flocking_law.md says what it gains and costs."""
+    """Time after which a neighbour may attract with `max_acceleration_m_s2`. Before that the limit grows with the
+    square of the time for which it has been seen. Most false neighbours last for a few seconds and are far away, where
+    Eq. 39 attracts most. null: no limit, as in the paper. docs/concepts/flocking_law.md explains it."""
     size: Literal["off", "learn"] = "off"
-    """`learn`: the drone estimates in flight how large the others are, all alike, where neither its owner nor the
-    networks know. For twelve seconds it moves up and down by 0.3 m; the shift of the others' bearings gives their
-    ranges, and so their size, for all later ranges. If you know the size, write `perception.drone_size_m`."""
+    """`learn`: the drone estimates in flight the size of the others, the same for all, if the networks do not know it.
+    It moves up and down by 0.3 m for twelve seconds; the shift of the others' bearings gives their ranges and so their
+    size, which is used for all later ranges. If you know the size, write `perception.drone_size_m` instead."""
     own_weight: NonNegative = 1.0
     """W_i of Eq. 42"""
     max_speed_m_s: Annotated[float, Field(gt=0, le=50)] = 3.0

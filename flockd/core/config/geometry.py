@@ -1,4 +1,4 @@
-"""Motions from paired points, and what feeds them."""
+"""Estimation of motions from paired points."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from flockd.core.config.base import Distance, Positive, Section
 
 
 class GeometryParameters(Section):
-    """Motions from paired points, and what feeds them."""
+    """Estimation of motions from paired points."""
 
     initial_threshold_m: Distance = 0.01
     """The first threshold of Algorithm 1."""
@@ -18,12 +18,12 @@ class GeometryParameters(Section):
     hypotheses: Annotated[int, Field(ge=1, le=100_000)] = 200
     """IT_MAX of Algorithm 1."""
     max_threshold_m: Distance = 2.0
-    """Beyond this the motion counts as not estimated."""
+    """If no motion is found up to this threshold, there is no estimate."""
     background_stride_px: Annotated[int, Field(ge=1, le=256)] = 16
-    """Between the matches of an image; 16 are the points at which Lucas & Kanade's method makes the flow exact."""
+    """Distance between matches in an image; at 16, the flow of all of them is refined by Lucas & Kanade's method."""
     max_depth_m: Distance = 40.0
-    """Background beyond this tells little of the translation and is left out."""
+    """Farther background is left out, because it contributes little to the translation."""
     own_displacement_sigma_m: Positive = 0.02
-    """Standard deviation of the own motion that images show over one step, each axis."""
+    """Standard deviation of the images' own displacement in a step, each axis."""
     refine: bool = True
-    """Polish the ego-motion by its reprojection error."""
+    """Whether the ego-motion is refined by minimising its reprojection error."""

@@ -1,4 +1,4 @@
-"""Loads a drone's YAML into its typed configuration, or says everything that is wrong with it."""
+"""Loads a drone's YAML into its typed configuration, or reports all of its faults."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from flockd.core.errors import ConfigError, ConfigProblem
 PATHS = {("perception", key) for key in ("models_dir", "engines_dir", *ROLES)} | {("telemetry", "zenoh_config")}
 """Keys of a drone whose values are paths; the value of a model's role only if it ends in `.yaml`, else it is a name."""
 OVERRIDE = "override"
-"""Stands in a problem in the place of a file's name."""
+"""Replaces the file's name in a problem of an override."""
 
 FileKind = Literal["drone", "scenario", "campaign"]
 Model = TypeVar("Model", bound=BaseModel)
@@ -31,7 +31,7 @@ _KINDS: Mapping[FileKind, tuple[str, tuple[str, ...]]] = {
     "scenario": ("a scenario", ("vehicles", "drone")),
     "drone": ("a drone's own file", ("rig",)),
 }
-"""Each kind's name, and its keys without a default, the one first that no other kind has."""
+"""The name of each kind of file, and its keys without a default; the first of them is unique to the kind."""
 
 
 def load_drone(path: Path | str, overrides: Overrides | None = None) -> DroneConfig:
@@ -44,7 +44,8 @@ def load_drone(path: Path | str, overrides: Overrides | None = None) -> DroneCon
 
 
 def load_real_drone(path: Path | str) -> tuple[DroneConfig, list[ConfigProblem]]:
-    """What a real drone flies with, first flights' limits included, and where that is outside the proven envelope.
+    """The configuration that a real drone flies with, with the limits of first flights, and its problems with the safe
+    envelope.
 
     Raises ConfigError with every problem found.
     """
@@ -54,7 +55,7 @@ def load_real_drone(path: Path | str) -> tuple[DroneConfig, list[ConfigProblem]]
 
 
 def kind_of(document: Document) -> FileKind:
-    """Whose file it is, by its keys; a scenario's, where that is not clear."""
+    """The kind of a file, by its keys; if that is not clear, a scenario."""
     keys = document.values.keys()
     if not keys & {"scenario", "drone"} and keys <= DroneConfig.model_fields.keys():
         return "drone"
@@ -62,7 +63,7 @@ def kind_of(document: Document) -> FileKind:
 
 
 def require(document: Document, wanted: FileKind) -> None:
-    """Raises ConfigError for the file of another kind, with what to name instead."""
+    """Raises ConfigError for a file of another kind, with the file to name instead."""
     kind = kind_of(document)
     words, (own, *_) = _KINDS[kind]
     if kind == wanted or own not in document.values:
@@ -78,7 +79,7 @@ def require(document: Document, wanted: FileKind) -> None:
 
 
 def drone_document(path: Path, overrides: Overrides) -> Document:
-    """A drone's file as it is written. Raises ConfigError where it cannot be read, or is of another kind."""
+    """A drone's file, not validated. Raises ConfigError if it cannot be read or is of another kind."""
     document = read_document(path)
     require(document, "drone")
     override(document, overrides)
@@ -86,9 +87,9 @@ def drone_document(path: Path, overrides: Overrides) -> Document:
 
 
 def _anchor(document: Document) -> None:
-    """Makes relative paths absolute: they count from the folder of the file they stand in, wherever flockd is run.
+    """Makes relative paths absolute: they start at the folder of their file, whatever the working directory.
 
-    Those of an override stay as they are, for its writer to know what they count from.
+    Paths of overrides stay relative to the working directory.
     """
     for path, place in document.places.items():
         section: Value = document.values
@@ -102,7 +103,7 @@ def _anchor(document: Document) -> None:
 
 
 def override(document: Document, overrides: Overrides) -> None:
-    """Sets single values; a problem with one names the override, not the file. Raises ConfigError inside a list."""
+    """Sets single values; their problems name the override, not the file. Raises ConfigError for an entry of a list."""
     for key, value in overrides.items():
         path = tuple(key.split("."))
         values = document.values

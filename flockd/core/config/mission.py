@@ -1,4 +1,4 @@
-"""Where a drone wants to go."""
+"""The mission of a drone."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from flockd.core.navigation import is_inside, metres_from
 MissionKind = Literal["circle_then_tangent", "hover", "velocity", "waypoints", "follow", "operator"]
 AtEnd = Literal["hold", "land", "return"]
 Faults = dict[tuple[str | int, ...], str]
-"""What is wrong, by the keys that lead there."""
+"""Messages by the keys that lead to the fault."""
 
 _ONLY_FOR: Mapping[str, MissionKind] = {
     "radius_m": "circle_then_tangent",
@@ -32,15 +32,15 @@ class WaypointParameters(Section):
     """A place to fly to: north_m and east_m, or latitude_deg and longitude_deg."""
 
     north_m: FromHome | None = None
-    """From the mission's origin; so `east_m`."""
+    """From the mission's origin; `east_m` likewise."""
     east_m: FromHome | None = None
     latitude_deg: Annotated[float, Field(ge=-85, le=85)] | None = None
-    """On the WGS 84 ellipsoid, as maps have it; so `longitude_deg`."""
+    """On the WGS 84 ellipsoid, as on maps; `longitude_deg` likewise."""
     longitude_deg: Annotated[float, Field(ge=-180, le=180)] | None = None
     height_m: Annotated[float, Field(ge=-1000, le=10_000)] | None = None
-    """Above the ground at home, flown to on the way there. null: as before."""
+    """Height above the ground at home, on the way to this waypoint. null: unchanged."""
     speed_m_s: Speed | None = None
-    """On the way there. null: the mission's."""
+    """Speed on the way to this waypoint. null: the mission's."""
 
     @model_validator(mode="after")
     def _is_one_place(self) -> Self:
@@ -53,38 +53,38 @@ class WaypointParameters(Section):
 
 
 class MissionParameters(Section):
-    """Where this drone wants to go. Places count from its home, the ground that it takes off from."""
+    """The mission of this drone. Positions count from its home, where it takes off."""
 
     kind: MissionKind = "circle_then_tangent"
-    """The paper's circle and its tangent (Eq. 43); `hover` at a standstill; a constant `velocity`; `waypoints` one
-    after the other. `follow`: the others, without a goal of its own (W_i = 0 of Eq. 42). `operator`: what an operator
-    sends over telemetry, as `telemetry.commands` allows."""
+    """`circle_then_tangent`: the paper's circle and its tangent (Eq. 43). `hover`: standstill. `velocity`: a constant
+    velocity. `waypoints`: one after the other. `follow`: no goal of its own (W_i = 0 of Eq. 42). `operator`: orders
+    over telemetry that `telemetry.commands` allows."""
     speed_m_s: Speed = 1.0
-    """Desired speed: V of Eq. 43, and on the way to goals."""
+    """Desired speed: V of Eq. 43, and the speed on the way to goals."""
     radius_m: Distance = 10.0
     """For `circle_then_tangent`."""
     circle_until_s: NonNegative = 66.0
-    """For `circle_then_tangent`: from then on straight."""
+    """For `circle_then_tangent`: time after which the course is straight."""
     velocity_m_s: tuple[float, float] | None = None
     """For `velocity`: north and east."""
     waypoints: Annotated[tuple[WaypointParameters, ...], Field(max_length=1000)] = ()
     at_end: AtEnd = "hold"
-    """After the last of the `waypoints`: hold the flock there, or have the autopilot land, or return home."""
+    """After the last of the `waypoints`: keep the flock there, or ask the autopilot to land or to return home."""
     reached_m: Distance = 1.0
-    """A goal is reached when the middle of the flock (this drone and the neighbours that it sees) is within this
-    distance, or came near it and comes no nearer. In flocks of a hundred, about the radius of the flock."""
+    """A goal is reached when the flock's middle (of this drone and the neighbours that it sees) is within this
+    distance, or came near it and comes no nearer. For flocks of a hundred write about the flock's radius."""
     timeout_s: Annotated[float, Field(gt=0, le=60)] = 2.0
-    """An operator's velocity holds for this long, and with kind `operator` a goal does too; then the drone hovers."""
+    """Duration of an operator's velocity, and with kind `operator` of a goal; then the drone hovers."""
     pull: NonNegative = 1.0
-    """Times `flocking.own_weight`, W_i of Eq. 42. Where k of n drones have a goal, the flock flies there with about
-    k/n of their speed; a larger pull makes up for that."""
+    """Factor on `flocking.own_weight`, W_i of Eq. 42. If k of n drones have a goal, the flock flies there at about k/n
+    of their speed; a larger factor compensates for that."""
     height_m: Annotated[float, Field(ge=-1000, le=10_000)] | None = None
-    """Above the ground at home, from the beginning on. null: as high as the drone is then."""
+    """Height above the ground at home, from the beginning on. null: the height at which the flight begins."""
     height_offset_m: Annotated[float, Field(ge=-1000, le=1000)] = 0.0
-    """Added to every height of the mission and of an operator's goals, so that drones that share one fly in layers."""
+    """Added to all heights of the mission and of an operator's goals, so that drones fly in layers."""
     origin_m: tuple[FromHome, FromHome] = (0.0, 0.0)
-    """Where metres of waypoints and of operators' goals count from, north and east of home. Drones that take off from
-    different places and share goals each write their own here."""
+    """Origin of the metres of waypoints and of operators' goals, north and east of home. Drones that take off from
+    different places and share goals need different values."""
 
     @model_validator(mode="after")
     def _keys_fit_the_kind(self) -> Self:
@@ -116,7 +116,7 @@ def describe(mission: MissionParameters) -> str:
 
 
 def mission_faults(mission: MissionParameters, gate: GateParameters, law_speed_m_s: float) -> Faults:
-    """What the gate and the law, up to `law_speed_m_s`, would not permit of a mission; by key."""
+    """Faults of a mission by key: values that the gate, or the law up to `law_speed_m_s`, would not permit."""
     limit_m_s = min(law_speed_m_s, gate.max_speed_m_s)
     faults = _faults_of_speeds(mission, limit_m_s)
     if mission.kind == "circle_then_tangent":
@@ -157,7 +157,7 @@ def _faults_of_speeds(mission: MissionParameters, limit_m_s: float) -> Faults:
 
 
 def fault_of_speed(limit_m_s: float, speed_m_s: float) -> str | None:
-    """What is wrong with a mission's speed; None: nothing."""
+    """The fault of a mission's speed; None: it has none."""
     if speed_m_s <= limit_m_s:
         return None
     return (
@@ -167,7 +167,7 @@ def fault_of_speed(limit_m_s: float, speed_m_s: float) -> str | None:
 
 
 def fault_of_height(gate: GateParameters, height_m: float) -> str | None:
-    """What is wrong with a height to fly at; None: nothing."""
+    """The fault of a height to fly at; None: it has none."""
     if gate.min_height_m <= height_m <= gate.max_height_m:
         return None
     return (
@@ -177,7 +177,7 @@ def fault_of_height(gate: GateParameters, height_m: float) -> str | None:
 
 
 def fault_of_place(gate: GateParameters, north_m: float, east_m: float) -> str | None:
-    """What is wrong with a place to fly to, from home; None: it is within the fence."""
+    """The fault of a position, metres from home; None: it is within the fence."""
     away_m = math.hypot(north_m, east_m)
     if gate.fence_radius_m is not None and away_m > gate.fence_radius_m:
         return f"is {_far(away_m)} from home, outside the fence of {gate.fence_radius_m:g} m; write a nearer place"
@@ -187,14 +187,14 @@ def fault_of_place(gate: GateParameters, north_m: float, east_m: float) -> str |
 
 
 def _fence_across_m(gate: GateParameters) -> float:
-    """No two places within the fence are farther apart."""
+    """Largest distance of two positions within the fence."""
     corners = gate.fence_corners_m
     sides_m = max((math.dist(a, b) for a, b in combinations(corners, 2)), default=math.inf)
     return min(sides_m, 2 * (FARTHEST_M if gate.fence_radius_m is None else gate.fence_radius_m))
 
 
 def _far(away_m: float) -> str:
-    """A distance; of one that places in metres cannot have, with what is likely of those in degrees."""
+    """A distance in words; if it is very large, with the likely mistake in degrees."""
     if away_m > 2 * FARTHEST_M:
         return f"{away_m / 1000:.0f} km (are latitude and longitude swapped, or a sign?)"
     return f"{away_m:.1f} m"

@@ -20,78 +20,77 @@ MAX_SIZE_SIGMA = 0.3
 
 
 class DetectionParameters(Section):
-    """How networks' outputs become detections. What belongs to a network's weights stands in its manifest instead."""
+    """From the networks' outputs to detections. Values that belong to a network's weights stand in its manifest."""
 
     min_range_m: Distance = 0.2
-    """A detection nearer than this is rejected: the two drones would touch."""
+    """A nearer detection is rejected: the two drones would touch."""
     max_range_m: Distance = 60.0
-    """A detection farther than this is rejected: such a drone would be smaller than a pixel or two."""
+    """A farther detection is rejected: such a drone is only a pixel or two wide."""
     crop_shift: Share = 0.03
-    """A further crop is not worth it when it would be moved by less than this share of half its width, ..."""
+    """No further crop is made if it would move by less than this share of half its width, ..."""
     crop_resize: Annotated[float, Field(ge=1)] = 1.05
-    """... and resized by less than this factor."""
+    """... and change its size by less than this factor."""
     suppression_gate: Positive = 3.4
-    """Two detections are one when their Mahalanobis distance is less: 99 % of pairs of one drone are nearer (chi-square
-    of three degrees of freedom)."""
+    """Mahalanobis distance below which two detections are of one drone; 99 % of pairs of one drone are nearer
+    (chi-square with three degrees of freedom)."""
     drone_extent: Share = 0.18
-    """Standard deviation of a drone's centre between two of its detections, as a share of its size. With the gate, two
-    drones are never nearer to each other than 0.6 of their size."""
+    """Standard deviation of the centre between two detections of one drone, as a share of its size. With this gate,
+    detections within 0.6 of a drone's size are always merged."""
     max_proposals: Annotated[int, Field(ge=1)] = 12
-    """The most regions of one image that pass from the first stage to the second: those of the highest score, so that a
-    cluttered image does not exceed the deadline. More than the drones that one camera sees."""
+    """Largest number of proposals of one image for the second stage, those of the highest scores, so that a cluttered
+    image does not exceed the deadline. It must be above the number of drones that one camera sees."""
     mask_border_px: Annotated[int, Field(ge=0)] = 5
-    """Background this near to a mask is not used: masks and depth maps are least certain there."""
+    """Border around masks in which background is not used, because masks and depth maps are uncertain there."""
     depth_map_sigma: Positive = 0.08
-    """Standard deviation of a drone's log range where the depth map alone gives it (`perception.distance: none`)."""
+    """Standard deviation of a drone's log range from the depth map alone (`perception.distance: none`)."""
 
 
 class NoiseParameters(Section):
-    """When an image counts as noise, and is not used. Lengths are of the image, and noise of its luminance."""
+    """Conditions under which an image counts as noise and is not used."""
 
     level: Positive = 12.0
     """Standard deviation, in grey levels of 0-255, of white noise that matters; a camera at night has less."""
     whiteness: Share = 0.8
-    """White noise is at the finest scale at least this strong as a share of the next; photographs have 0.3 to 0.6."""
+    """Least strength of white noise at the finest scale as a share of the next scale's; photographs have 0.3 to 0.6."""
     max_white: Share = 0.25
-    """The image is not used where a larger share of it is white noise. 1, also of the rises below: all are used."""
+    """Largest share of white noise in an image that is used. 1 here, or in the three limits below: no limit."""
     max_white_rise: Share = 0.08
-    """The image is not used where the share of white noise exceeds that of the last half minute by this."""
+    """Largest increase of that share over the last half minute."""
     rough_level: Positive = 20.0
     """Strength, in grey levels, above which details at one of the finest scales count as rough."""
     max_rough_rise: Share = 0.4
-    """The image is not used where the rough share exceeds that of the last half minute by this."""
+    """Largest increase of the rough share over the last half minute."""
     max_unexplained: Share = 0.35
-    """The image is not used if a larger share of it than in the other cameras, by this much, cannot be predicted from
-    the image before: it is damaged in blocks, or covered by soft noise. 1: all are used."""
+    """Largest share of an image, above that of the other cameras, that cannot be predicted from the image before. More
+    is damage in blocks, or soft noise. 1: no limit."""
     min_clarity: Share = 0.35
-    """The image is not used if its ground has kept less than this share of the contrast or sharpness that the camera
-    showed before, and the other cameras lost less. The lens is then covered, dirty, fogged or in the sun. 0: all are
-    used."""
+    """Least share of the earlier contrast and sharpness of the ground, if the other cameras lost less. Below it the
+    lens is covered, dirty, fogged or in the sun, and the image is not used. 0: no limit."""
     clean_images: Annotated[int, Field(ge=1, le=100)] = 2
-    """Clean images in a row before a camera that was noisy is used again."""
+    """Number of clean images in a row after which a noisy camera is used again."""
 
 
 class RangeFinderParameters(Section):
-    """When a range to the ground is used, and how the ground below is followed from ranges."""
+    """Conditions for using a range to the ground, and the filter of the ground below."""
 
     max_age_s: Annotated[float, Field(gt=0, le=5)] = services.GROUND_RANGE.timeout
-    """An older reading is not used: the sensor has stopped."""
+    """Largest age of a reading; the sensor has stopped if it is older."""
     min_quality: Share = 0.1
-    """A reading with a weaker signal is not used, where the sensor reports its strength."""
+    """Least signal quality of a reading, if the sensor reports it."""
     noise: Annotated[float, Field(gt=0, le=0.2)] = 0.02
-    """Standard deviation of a range, as a share of it."""
+    """Standard deviation of a range, as a share of the range."""
     bridge_s: Annotated[float, Field(ge=0, le=10)] = 2.0
-    """For this long after the last good reading the ground is expected where it was, with its slope."""
+    """Time after the last good reading for which the ground is extrapolated with its slope."""
     gate_sigma: Positive = consistency.RANGE_GROUND.limit
-    """A reading farther than this from the expected ground, in standard deviations, is of something else: a crate,
-    another drone, a hole. The next one like it is used, unless it contradicts the height by the next three keys."""
+    """Largest distance of a reading from the expected ground, in standard deviations. One farther reading is not used:
+    it may be of a crate or a drone. The next one is used, unless it contradicts the height by the next three keys."""
     max_slope: Annotated[float, Field(ge=0, le=2)] = consistency.RANGE_SLOPE.limit
-    """For each metre flown the ground rises or falls by no more than this."""
+    """Steepest slope of the ground."""
     tolerance_m: Annotated[float, Field(gt=0, le=100)] = consistency.RANGE_BAROMETER.limit
-    """Added for a step in the ground, for the barometer's drift, and to `gate_sigma` of the range. A range finder whose
-    readings and the barometer's height contradict each other by more is not used."""
+    """Allowance for a step of the ground and for the barometer's drift. A range finder that contradicts the barometer's
+    height by more than this, the slope and `gate_sigma` is not used."""
     compare_s: Annotated[float, Field(gt=0, le=120)] = 15.0
-    """Time in which the barometer may drift by `tolerance_m`. After a longer gap the ground is no longer known."""
+    """Time in which the barometer may drift by `tolerance_m`. After a longer gap of readings the ground is unknown."""
 
 
 class PerceptionConfig(Section):
@@ -101,47 +100,44 @@ class PerceptionConfig(Section):
     """
 
     flow: str = "flow_int8"
-    """`dis` is OpenCV's DIS flow instead of a network."""
+    """Optical flow; `dis` is OpenCV's DIS instead of a network."""
     flow_refinement: FlowRefinement = "lucas_kanade"
-    """A network's flow finds what moved far; this makes it exact. `lucas_kanade` is for flight: 4 ms an image.
-    It follows points 16 px apart, and where the images show nothing, the surroundings determine the flow. `dis` takes
-    34 ms, and each pixel keeps its own flow: for a sensor's depth, and images that are blurred and moved far.
+    """Refinement of a network's flow, which finds large displacements. `lucas_kanade` is for flight: it takes 4 ms an
+    image, tracks points 16 px apart, and fills areas without texture from their surroundings. `dis` takes 34 ms and
+    refines each pixel: for a depth sensor, and for blurred images with large displacements.
     """
     depth: str = "neighbours_int8"
     segmentation: str = "neighbours_int8"
     detector: str = "detector"
-    """Boxes of drones, found in the whole image. `none`: the segmentation alone proposes where a drone may be."""
+    """Boxes of drones in the whole image. `none`: only the segmentation makes proposals."""
     distance: str = "distance_int8"
-    """Second stage: a drone's range from its crop alone. `none`: the depth map decides."""
+    """Second stage: a drone's range from its crop. `none`: the range comes from the depth map."""
     verification: str = "verification_int8"
-    """Whether a crop of the second stage shows a drone at all. `none`: the distance network alone says so."""
+    """Second stage: the probability that a crop shows a drone. `none`: it comes from the distance network alone."""
     models_dir: str | None = None
     """Folder of the manifests; by default the one that comes with flockd."""
     threads: Annotated[int, Field(ge=1, le=64)] = 2
-    """Of the networks. A drone's daemon computes as many of its cameras at once, and shares out what is left."""
+    """Threads for the networks. The daemon processes this many cameras in parallel, or one with several threads."""
     provider: Provider = "cpu"
-    """What computes the networks. Another one than this is never used in its place, but `openvino` leaves crops to
+    """Provider that computes the networks. flockd never changes to another one, but `openvino` leaves crops to
     `cpu`."""
     engines_dir: str | None = None
-    """Where `flockd models prepare` keeps what a provider has built; by default `engines` beside the manifests."""
+    """Folder for the engines that `flockd models prepare` builds; by default `engines` beside the manifests."""
     deadline_s: Annotated[float, Field(gt=0, le=60)] = 1.0
-    """In flight, a network that has not finished one call by then is stuck, and is ended."""
+    """Longest time of a network call in flight; a longer one is ended."""
     detection: DetectionParameters = DetectionParameters()
     noise: NoiseParameters = NoiseParameters()
     drone_size_m: Annotated[float, Field(ge=MIN_DRONE_SIZE_M, le=MAX_DRONE_SIZE_M)] | None = None
-    """Size of every drone of the fleet, from tip to tip with propellers, where it is known: a drone's range is then
-    this over its apparent size. By default the network estimates each drone's size, which is often wrong by a quarter
-    for an airframe that it was not trained on."""
+    """Size of every drone of the fleet, from tip to tip with propellers. A drone's range is this over its apparent
+    size. By default the network estimates it, often wrong by a quarter for an airframe that it was not trained on."""
     drone_size_sigma_m: NonNegative = 0.01
-    """Standard deviation of `drone_size_m`; the default is a tape measure's. It adds to the deviation of every
-    range."""
+    """Standard deviation of `drone_size_m`, by default that of a tape measure. It adds to that of every range."""
     scale: ScaleSource = "height"
-    """The background's metric scale: `network` (pure RGB, as in the paper) or `height` (attitude and height above
-    ground from the autopilot)."""
+    """Source of the background's metric scale: `network` (images, as in the paper) or `height` (the autopilot's)."""
     height: HeightSource = "barometer"
-    """What measures the height for `scale: height`. `barometer`: the autopilot's height above home, so that the ground
-    must be level. `range_finder`: a sensor that faces down; without a good reading there is no scale. `best`: the range
-    finder, and while that gives nothing, the barometer."""
+    """Source of the height for `scale: height`. `barometer`: the autopilot's height above home, for level ground only.
+    `range_finder`: a sensor that faces down; without a good reading there is no scale. `best`: the range finder, or the
+    barometer while the range finder gives no good reading."""
     range_finder: RangeFinderParameters = RangeFinderParameters()
 
     @model_validator(mode="after")

@@ -1,4 +1,4 @@
-"""How fast real drones may fly: the speed from which they stop in time, and their first flights."""
+"""Speed limits of real drones: the speed from which they stop in time, and first flights."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ _ROUNDING = 1e-12
 
 
 def as_flown(config: DroneConfig) -> DroneConfig:
-    """What a real drone flies with: the same, but with `safety.first_flight_layer` at that layer's height, and slowly.
+    """The configuration that a real drone flies with: with `safety.first_flight_layer`, at that layer's height and
+    slowly.
 
     No speed is above `FIRST_SPEED_M_S`, and no waypoint has a height. The gate's limit stays: what corrects wind needs
     it.
@@ -49,23 +50,26 @@ def _slow(speed_m_s: float | None) -> float | None:
 
 
 _KNOWN_M = 7.0
-"""From how far away drones that meet are detected. By sight, drones that met head-on at 2 m/s each confirmed each other
-at 4.6 m (median of 12 tracks of the flights in config/perceived/shipped_networks.yaml), as if detected from here on."""
+"""Range at which drones that meet are first detected. By sight, drones that met head-on at 2 m/s each confirmed each
+other at 4.6 m (median of 12 tracks of the flights in config/perceived/shipped_networks.yaml), which follows from a
+first detection at this range."""
 _RANGE_ERROR = 0.09
-"""By which share of its range a neighbour is nearer than it seems, for seconds: two standard deviations of what lasts
-of the shipped networks' errors (trained `range_error` of that file, times the root of `tracking.range_error_lasts`)."""
+"""Share of its range by which a neighbour may be nearer than estimated for seconds: two standard deviations of the
+persistent errors of the shipped networks (`range_error` of trained airframes in that file, times the root of
+`tracking.range_error_lasts`)."""
 
 
 def safe_speeds(config: DroneConfig) -> tuple[float, float]:
-    """The speeds v, m/s, up to which a drone keeps `min_separation_m` s: behind a mate that stops; before one it meets.
+    """The speeds v, m/s, up to which a drone keeps `min_separation_m` s: behind a mate that stops, and from a drone
+    that it meets.
 
-    What a neighbour begins shows in the drone's own velocity after t = step_s (1 + degraded_load) + reaction_s: the
-    step in which it was seen last, the next, which takes as long at most while the drone is not degraded, and the
-    drone's response. Then the drone brakes by b = `braking_m_s2`. Ranges err by the share e.
+    A drone reacts to a neighbour's manoeuvre after t = step_s (1 + degraded_load) + reaction_s: the rest of the current
+    step, the computation of the next one, and the drone's response. Then the drone brakes by b = `braking_m_s2`. Ranges
+    err by the share e.
 
-    A mate ahead, at d = `desired_distance_m`, stops by a = `max_acceleration_m_s2`, as the gate reckons with (one that
-    brakes less than the drone counts as braking alike): v t + v^2 / 2b - v^2 / 2a = d (1 - e) - s.
-    One that comes as fast, detected from R on, does as the drone does: 2 (v t + v^2 / 2b) = R (1 - e) - s.
+    A mate ahead, at d = `desired_distance_m`, brakes by a = `max_acceleration_m_s2`, as the gate assumes, but at least
+    as hard as the drone: v t + v^2 / 2b - v^2 / 2a = d (1 - e) - s. An oncoming drone of the same speed, detected from
+    R on, brakes like the drone: 2 (v t + v^2 / 2b) = R (1 - e) - s.
 
     Source: Shalev-Shwartz et al. 2017, "On a formal model of safe and scalable self-driving cars", definitions 1 and 2,
     with nobody speeding up.
@@ -84,7 +88,7 @@ def safe_speeds(config: DroneConfig) -> tuple[float, float]:
 
 
 def beyond_envelope(config: DroneConfig) -> dict[KeyPath, str]:
-    """Which speeds are too high, and what to do, by key; nothing for a drone without an autopilot."""
+    """Messages about speeds that are too high, with the remedy, by key; empty for a drone without an autopilot."""
     if config.autopilot is None:
         return {}
     law_m_s, gate_m_s, usual_m_s = (of.max_speed_m_s for of in (config.flocking, config.safety.gate, GateParameters()))
@@ -105,13 +109,13 @@ def beyond_envelope(config: DroneConfig) -> dict[KeyPath, str]:
 
 
 def _remedy(most_m_s: float, more: list[str]) -> str:
-    """What to write instead: no lower speed where none is low enough."""
+    """The remedy; it names a lower speed only if one is low enough."""
     slower = [f"{most_m_s:g} or less"] if most_m_s > 0.0 else []
     return "write " + ", or ".join(slower + more)
 
 
 def outside_envelope(config: DroneConfig, places: Mapping[KeyPath, Place]) -> list[ConfigProblem]:
-    """The same of `config` as it is flown, as problems; `places` has every value that is no default."""
+    """The same as problems, for `config` as it is flown; `places` has every value that is not a default."""
     file = next(iter(places.values())).file
     return [
         places[key].problem(text)

@@ -1,4 +1,4 @@
-"""The cameras of a drone: their projections, where they sit, and their time."""
+"""The cameras of a drone: projections, mounting and time offset."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from flockd.core.config.base import NonNegative, PlainName, Positive, Section, r
 
 
 class MeasurementConfig(Section):
-    """Where calibrated numbers come from, for people; flights do not use it. `flockd calibrate` writes it."""
+    """The source of calibrated numbers, for people; flights do not use it. `flockd calibrate` writes it."""
 
     date: Annotated[str, text(r"^\d{4}-\d{2}-\d{2}$", "a date, as in `2026-11-24`")]
     camera: str
-    """Its path, or what else identifies it."""
+    """Its path, or another name that identifies it."""
     source: str
-    """What it was measured from."""
+    """The images or recordings it was measured from."""
     views: Annotated[int, Field(ge=1)]
     """Number of views of a board, or of pairs of images of a scene."""
     residual_px: NonNegative | None = None
     """Root mean square of the fit's residuals."""
     residual_deg: NonNegative | None = None
-    """The same, of a fit to attitudes."""
+    """The same for a fit to attitudes."""
 
 
 class IntrinsicsConfig(Section):
@@ -42,11 +42,12 @@ class IntrinsicsConfig(Section):
 
 
 _OnBoard = Annotated[float, Field(ge=-5, le=5)]
-"""Metres; as far from the middle as any of these vehicles has a camera."""
+"""Metres; the largest offset of a camera on such vehicles."""
 
 
 class ExtrinsicsConfig(Section):
-    """Where a camera sits: body FRD metres, and its turn from looking forward: yaw right, pitch up, roll clockwise."""
+    """Mounting of a camera: position in body FRD, and angles from looking forward: yaw right, pitch up, roll
+    clockwise."""
 
     position_m: tuple[_OnBoard, _OnBoard, _OnBoard] = (0.0, 0.0, 0.0)
     yaw_deg: float = 0.0
@@ -72,16 +73,16 @@ class CameraConfig(Section):
 
 _COEFFICIENTS = {"pinhole": (0, 4, 5), "wide_angle": (0, 4)}
 _OFF_CENTRE = 0.16
-"""Share of the width or height between the principal point and the middle. That of a lens calibrated for half or twice
-the size, or for an image on its side, is farther off; real ones lie within some percent."""
+"""Largest distance of the principal point from the image's middle, as a share of width or height. It is larger if a
+lens was calibrated for another size or for an image on its side; of real lenses it is some percent."""
 _SQUARE = 0.15
-"""How much fx and fy may differ: pixels are square, unless images were squeezed from another aspect."""
+"""Largest difference of fx and fy: pixels are square unless images were squeezed from another aspect ratio."""
 NARROWEST_DEG = 5.0
 WIDEST_DEG = {"pinhole": 130.0, "wide_angle": 220.0}
 
 
 def _lens_faults(lens: IntrinsicsConfig, size: tuple[int, int]) -> dict[str, str]:
-    """What makes a calibration impossible for images of this size, by its key."""
+    """Reasons why a calibration is impossible for images of this size, by key."""
     words = f"{size[0]} x {size[1]} images"
     again = "correct it, or calibrate the camera at the size of its images"
     if len(lens.distortion) not in _COEFFICIENTS[lens.model]:
@@ -105,7 +106,8 @@ def _lens_faults(lens: IntrinsicsConfig, size: tuple[int, int]) -> dict[str, str
 
 
 def field_of_view_deg(lens: IntrinsicsConfig, size: tuple[int, int]) -> float:
-    """Across the longer side, the principal point in its middle; NaN where the lens images nothing at the border."""
+    """Field of view across the longer side, the principal point in its middle; NaN if the lens does not image the
+    border."""
     pinhole = lens.model == "pinhole"
     radial = (*lens.distortion[:2], *lens.distortion[4:5]) if pinhole else lens.distortion
     ideal = np.linspace(0.0, 10.0 if pinhole else math.pi, 2000)  # tangents to 84 degrees, or angles off the axis
@@ -122,7 +124,7 @@ class RigConfig(Section):
 
     cameras: Annotated[tuple[CameraConfig, ...], Field(min_length=1)]
     time_offset_s: Annotated[float, Field(ge=-1, le=1)] = 0.0
-    """Added to the time stamp of a frame: the time at which the autopilot had the attitude in which it was taken."""
+    """Added to a frame's time stamp, it gives the time of the autopilot's attitude at which the frame was taken."""
 
     @model_validator(mode="after")
     def _names_are_unique(self) -> Self:

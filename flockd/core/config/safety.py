@@ -12,49 +12,49 @@ from flockd.core.config.base import Duration, FromHome, Positive, Section, Share
 from flockd.core.navigation import crosses_itself, is_inside
 
 LOWEST_LAYER_M, LAYERS_APART_M = 3.0, 4.0
-"""Of first flights: a metre more than `vertical_separation_m` for errors of two drones' heights."""
+"""Distance of layers in first flights: `vertical_separation_m`, and a metre for errors of two drones' heights."""
 
 
 class GateParameters(Section):
-    """The last limits on what is sent to the autopilot, whatever asks for it."""
+    """The last limits on setpoints, whatever code requests them."""
 
     permission_timeout_s: Annotated[float, Field(gt=0, le=0.4)] = services.PERMISSION.timeout
-    """The supervisor's permission is valid for this long: what has stalled sends nothing half a second later."""
+    """Validity of the supervisor's permission: half a second after flockd stalls it sends no setpoint."""
     command_fresh_s: Annotated[float, Field(gt=0, le=60)] = services.WANTED.timeout
-    """A command older than this is flown ever more slowly. Allow a step and its duration."""
+    """A command older than this is flown more and more slowly. Allow for a step and its computation."""
     command_timeout_s: Annotated[float, Field(gt=0, le=60)] = services.WANTED_GONE.timeout
-    """At this age of the command the drone stands still; it flies no older one. Allow three pilot's steps."""
+    """Age of a command at which the drone stands still. Allow for three steps of the pilot."""
     max_speed_m_s: Annotated[float, Field(gt=0, le=50)] = 4.0
-    """A command that asks for more is a fault, and refused."""
+    """A faster command counts as a fault and is refused."""
     max_acceleration_m_s2: Annotated[float, Field(gt=0, le=50)] = 5.0
     degraded_speed_m_s: Annotated[float, Field(gt=0, le=50)] = 1.0
-    """Instead, while the drone is degraded: a faster command is flown at this speed."""
+    """The limit while the drone is degraded: a faster command is flown at this speed."""
     min_separation_m: Annotated[float, Field(ge=0, le=1000)] = 1.0
-    """Nearer than this to a neighbour, no velocity towards it."""
+    """Distance to a neighbour below which no velocity towards it is allowed."""
     degraded_separation_m: Annotated[float, Field(ge=0, le=1000)] = 1.5
-    """Instead, while the drone is degraded."""
+    """The same while the drone is degraded."""
     vertical_separation_m: Annotated[float, Field(ge=0, le=1000)] = 3.0
-    """A neighbour that is above or below by less than this counts as one at the drone's height. No change of height
-    leads nearer to one whose level distance is within one and a half times `degraded_separation_m`: the lower flies in
-    the other's downwash."""
+    """A neighbour less than this above or below counts as one at the drone's height. The drone does not climb or sink
+    towards a neighbour whose horizontal distance is below 1.5 times `degraded_separation_m`, because the lower drone
+    flies in the other's downwash."""
     max_climb_m_s: Annotated[float, Field(gt=0, le=20)] = 1.5
-    """The height setpoint changes no faster than this, up or down."""
+    """Largest rate of the height setpoint, up or down."""
     braking_m_s2: Annotated[float, Field(gt=0, le=20)] = 1.5
-    """How hard every drone of the flock can brake: none flies faster towards a neighbour or an obstacle than it can
-    stop in time."""
+    """Braking that every drone of the flock can do: a drone flies towards a neighbour or an obstacle only so fast that
+    it can stop in time."""
     obstacle_clearance_m: Annotated[float, Field(ge=0, le=100)] = 0.6
-    """From the drone's middle to an obstacle's surface: nearer than this, no velocity towards it."""
+    """Distance of the drone's centre from an obstacle's surface below which no velocity towards it is allowed."""
     reaction_s: Annotated[float, Field(gt=0, le=5)] = 0.5
-    """From seeing an obstacle until the own drone has begun to brake. Its velocity is expected to follow its setpoints
-    with this time constant."""
+    """Time from the detection of an obstacle until the drone brakes. It is also the time constant with which the
+    drone's velocity is expected to follow its setpoints."""
     neighbour_reaction_s: Annotated[float, Field(ge=0, le=5)] = 1.0
-    """From a neighbour's change of velocity until the own drone begins to brake: the rest of a step, in which the
-    change is not seen, the computation of the next one, and the drone's response."""
+    """Time from a neighbour's change of velocity until the drone brakes: the rest of the step, the computation of the
+    next one, and the drone's response."""
     fence_radius_m: Annotated[float, Field(gt=0, le=100_000)] | None = 100.0
-    """Around home, level: the drone brakes before it as before an obstacle; beyond it only inward velocity. null: no
-    circle."""
+    """Radius of a circular fence around home. The drone brakes before it as before an obstacle; beyond it, it only
+    flies inward. null: no circle."""
     fence_corners_m: tuple[tuple[FromHome, FromHome], ...] = ()
-    """A fence of any shape: its corners north and east of home, in order. With a radius too, both hold."""
+    """A fence of any shape: its corners in order, north and east of home. If a radius is given too, both hold."""
     min_height_m: Annotated[float, Field(ge=-1000, le=10_000)] = 1.0
     max_height_m: Annotated[float, Field(ge=-1000, le=10_000)] = 30.0
 
@@ -82,63 +82,63 @@ class GateParameters(Section):
 
 
 class SafetyParameters(Section):
-    """When the drone slows down, hovers, hands over to the autopilot and falls silent."""
+    """Limits at which the drone slows down, hovers, hands over to the autopilot or falls silent."""
 
     gate: GateParameters = GateParameters()
     camera_timeout_periods: Annotated[float, Field(gt=0, le=100)] = services.FRAME.timeout
-    """A camera without a usable frame for this many of its frame periods is lost."""
+    """A camera counts as lost after this many frame periods without a usable frame."""
     max_lost_cameras: Annotated[int, Field(ge=0)] = 1
-    """Fly on with the others, degraded, while no more than this many are lost; at least one has to see."""
+    """Largest number of lost cameras with which the drone flies on, degraded; at least one camera must work."""
     max_dropped_share: Share = 0.2
-    """Degraded when a larger share of the latest frames was dropped."""
+    """Degraded if a larger share of the last frames was dropped."""
     estimate_timeout_s: Annotated[float, Field(gt=0, le=60)] = services.ESTIMATE.timeout
-    """Hover when the pilot's newest output is older; allow three steps. At most `gate.command_timeout_s`."""
+    """Hover if the pilot's newest output is older. Allow for three steps; at most `gate.command_timeout_s`."""
     degraded_ego_motion_s: Annotated[float, Field(gt=0, le=600)] = 0.75
-    """Degraded when no step has found the own motion for this long: at two steps a second, two in a row."""
+    """Degraded if no step has found the own motion for this long: at two steps a second, after two without it."""
     max_ego_motion_s: Annotated[float, Field(gt=0, le=600)] = 2.75
-    """Hover when no step has found it for this long."""
+    """Hover if no step has found it for this long."""
     degraded_load: Positive = 1.0
-    """Degraded when the duration of the steps (95th percentile) over the permitted one is above this."""
+    """Degraded if the duration of steps (95th percentile) over the permitted duration is above this."""
     max_load: Positive = 2.0
-    """Hover when it is above this."""
+    """Hover if it is above this."""
     degraded_temperature_c: float = 85.0
-    """Degraded from this temperature of the hottest thermal zone on."""
+    """Degraded from this temperature on, in the hottest thermal zone."""
     max_temperature_c: float = 95.0
     """Hover from this temperature on."""
     max_loop_lag_s: Annotated[float, Field(gt=0, le=10)] = 0.2
-    """Degraded when the event loop lags by more."""
+    """Degraded if the event loop lags by more."""
     degraded_velocity_error_m_s: Positive = consistency.RESPONSE_DEGRADED.limit
-    """Degraded when the drone's velocity deviates from its setpoints by more (root mean square over ten seconds)."""
+    """Degraded if the velocity deviates from its setpoints by more (root mean square over ten seconds)."""
     max_velocity_error_m_s: Positive = consistency.RESPONSE.limit
-    """Hold is requested when it deviates by more than this."""
+    """Hold is requested if it deviates by more than this."""
     hold_room_m: Annotated[float, Field(ge=0, le=100)] = 2.0
-    """Hold knows of no obstacles. So it is then requested where none is nearer than this to the drone's middle; until
-    then, for 30 s at most, the drone flies on, degraded."""
+    """Hold ignores obstacles. So it is requested only if no obstacle is within this distance of the drone's centre.
+    Until then, for 30 s at most, the drone flies on, degraded."""
     heartbeat_timeout_s: Annotated[float, Field(gt=0, le=10)] = services.HEARTBEAT.timeout
-    """The link to the autopilot counts as lost without a heartbeat for this long, and flockd falls silent for good; two
-    of them may be lost while other messages arrive."""
+    """After this time without a heartbeat the link to the autopilot counts as lost, and flockd stays silent. Two
+    heartbeats may be missing while other messages arrive."""
     link_timeout_s: Annotated[float, Field(gt=0, le=10)] = services.AUTOPILOT.timeout
-    """The same, without any message of the autopilot."""
+    """The same without any message of the autopilot."""
     neighbours_timeout_s: Annotated[float, Field(gt=0, le=60)] = services.NEIGHBOUR.timeout
-    """No confirmed neighbour seen for this long: the drone is alone."""
+    """Time without a confirmed neighbour after which the drone counts as alone."""
     alone_s: Duration | None = 10.0
-    """How long it flies on alone before it asks for Hold. null: for ever."""
+    """Time for which it flies on alone before it asks for Hold. null: no limit."""
     outside_s: Annotated[float, Field(gt=0, le=60)] = 3.0
-    """How long it may take to come back into the fence and the heights before it asks for Hold."""
+    """Time for returning into the fence and the heights before it asks for Hold."""
     on_battery_low: AutopilotMode = "hold"
-    """What flockd requests from the autopilot when that reports a low battery."""
+    """Mode that flockd requests if the autopilot reports a low battery."""
     on_position_lost: AutopilotMode = "hold"
-    """What flockd requests from the autopilot when that has lost its position; the autopilot acts by itself too."""
+    """Mode that flockd requests if the autopilot has lost its position; the autopilot also acts by itself."""
     hover_s: Annotated[float, Field(gt=0, le=3)] = 1.0
-    """The longest hover, before Hold is asked for."""
+    """Longest hover before it asks for Hold."""
     recovery_s: Annotated[float, Field(ge=0, le=600)] = 2.0
-    """How long a degraded drone has to be without a fault before it flies as usual again."""
+    """Time without a fault after which a degraded drone flies normally again."""
     ask_timeout_s: Annotated[float, Field(gt=0, le=5)] = 2.0
-    """How long the autopilot has to leave offboard on request, before flockd falls silent."""
+    """Time for the autopilot to leave offboard on request, before flockd falls silent."""
     first_flight_layer: Annotated[int, Field(ge=1, le=100)] | None = None
-    """For first flights: the drone's number in its flock, another for each. A real drone then flies at 1 m/s at most,
-    and at 3 m above the ground at home and 4 m more for each number after 1, whatever its mission says. null: off.
-    Simulated flights ignore it."""
+    """For first flights: the drone's number in its flock, different for each. A real drone then flies at 1 m/s at most,
+    in a layer 3 m above the ground at home for number 1 and 4 m higher for each further number, whatever its mission
+    says. null: off. Simulated flights ignore it."""
 
     @model_validator(mode="after")
     def _worse_comes_later(self) -> Self:
@@ -169,5 +169,5 @@ class SafetyParameters(Section):
 
 
 def layer_height_m(layer: int) -> float:
-    """Height above the ground at home of a layer of first flights, counted from 1."""
+    """Height above the ground at home, metres, of a layer of first flights, counted from 1."""
     return LOWEST_LAYER_M + (layer - 1) * LAYERS_APART_M

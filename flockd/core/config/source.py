@@ -1,4 +1,4 @@
-"""Where camera frames come from."""
+"""The source of camera frames."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class ControlParameters(Section):
     name: Annotated[str, text(r"^[a-z0-9_]+$", "a control's name, of small letters, digits and `_`")]
     """As `v4l2-ctl --list-ctrls` prints it."""
     value: int
-    """A menu's entry by its number; a switch as 0 or 1."""
+    """For a menu the number of the entry; for a switch 0 or 1."""
 
 
 _Edge = Annotated[int, Field(ge=0, le=32768)]
@@ -30,55 +30,56 @@ _Side = Annotated[int, Field(ge=32, le=32768)]
 
 
 class CameraDeviceParameters(Section):
-    """Where one camera of the rig is plugged in, and how it is run. Its image has the size the rig says."""
+    """The device of one camera of the rig, and its settings. Its image must have the rig's `size_px`."""
 
     name: PlainName
     """The camera's name in the rig."""
     device: (
         Annotated[str, text(r"^/dev/", "a device, as in `/dev/video0` or an entry of `/dev/v4l/by-path`")] | None
     ) = None
-    """For kind `v4l2`: its path, best one of /dev/v4l/by-path."""
+    """For kind `v4l2`: the path of the device, preferably one in /dev/v4l/by-path."""
     pipeline: Annotated[str, Field(min_length=1)] | None = None
-    """For kind `gstreamer`: elements as `gst-launch-1.0` takes them, without a sink."""
+    """For kind `gstreamer`: a pipeline as for `gst-launch-1.0`, without a sink."""
     topic: Annotated[str, Field(pattern=_TOPIC)] | None = None
-    """For kind `ros`: of sensor_msgs/Image or CompressedImage, as in `/front/image_raw`."""
+    """For kind `ros`: a topic of sensor_msgs/Image or CompressedImage, such as `/front/image_raw`."""
     camera_info: Annotated[str, Field(pattern=_TOPIC)] | None = None
-    """For kind `ros`: of its CameraInfo, which is compared with the rig; by default `camera_info` beside the images."""
+    """For kind `ros`: topic of its CameraInfo, which must agree with the rig; by default `camera_info` beside the
+    images."""
     stamps: Literal["system", "simulator"] = "system"
-    """For kind `ros`: what the images' stamps are of, this computer's clock or that of a simulator in `/clock`, which
-    has to run in real time."""
+    """For kind `ros`: the clock of the images' stamps, either this computer's or a simulator's on `/clock`. The
+    simulator has to run in real time."""
     pixel_format: PixelFormat = "mjpeg"
-    """For kind `v4l2`; pipelines and topics say it themselves."""
+    """For kind `v4l2`; pipelines and topics give it themselves."""
     turn_deg: Literal[0, 90, 180, 270] = 0
-    """For kind `v4l2`: by how much its images are turned, clockwise, so that up is up, where the camera is mounted on
-    its side or upside down. `size_px` and the lens in the rig are of the turned image. Pipelines have `videoflip`; the
-    parts that `crop` cuts are turned for each kind."""
+    """For kind `v4l2`: clockwise angle that turns images upright if the camera is mounted on its side or upside down.
+    `size_px` and the lens in the rig are those of the turned image. In pipelines use `videoflip`. Parts that `crop`
+    cuts are turned for every kind."""
     crop: tuple[_Edge, _Edge, _Side, _Side] | None = None
-    """Left, top, width and height of this camera's part, in pixels of the image as it comes. Boards for several cameras
-    send one image of all: their entries name one device, pipeline or topic, each with its crop. `size_px` and the lens
-    in the rig are of the part."""
+    """Left, top, width and height of this camera's part, in pixels of the image as it comes. For boards that send one
+    image of several cameras: their entries name the same device, pipeline or topic, each with its crop. `size_px` and
+    the lens in the rig are those of the part."""
     crop_of: tuple[_Side, _Side] | None = None
-    """Width and height of the image that `crop` is cut from; by default it ends where the crops end."""
+    """Width and height of the whole image that `crop` is a part of; by default it ends where the crops end."""
     reduce: Literal[1, 2, 4] = 1
-    """For kind `v4l2`: the camera sends images this many times as wide and as high as the rig says, and flockd reduces
-    them: they then have less noise and less of what compression leaves."""
+    """For kind `v4l2`: the camera sends images that are wider and higher than `size_px` by this factor, and flockd
+    reduces them. This lowers noise and compression artefacts."""
     rate_hz: Annotated[float, Field(gt=0, le=1000)] = 30.0
     controls: tuple[ControlParameters, ...] = ()
-    """For kind `v4l2`: set in this order whenever the camera is opened; what is not named here stays as it was."""
+    """For kind `v4l2`: settings of the driver, in this order, each time the camera is opened; others stay unchanged."""
 
     @property
     def place(self) -> str:
-        """Where its images come from: the device, the pipeline or the topic."""
+        """The device, the pipeline or the topic."""
         return self.device or self.pipeline or self.topic or ""
 
     @property
     def size_words(self) -> tuple[str, str]:
-        """What says how large its device's images are, and the key that says it."""
+        """For errors: the words for the place that sets the size of the device's images, and the key."""
         return ("the rig has", "size_px") if self.crop is None else ("its crop is of", "crop_of")
 
     @property
     def cut_px(self) -> tuple[int, int] | None:
-        """Width and height of `crop`, reduced and turned: what `size_px` in the rig has to be."""
+        """Width and height of `crop`, reduced and turned; `size_px` in the rig must equal it."""
         if self.crop is None:
             return None
         width, height = (side // self.reduce for side in self.crop[2:])
@@ -86,36 +87,36 @@ class CameraDeviceParameters(Section):
 
 
 class SharedMemoryParameters(Section):
-    """Where frames come from when another program on this computer takes or draws them."""
+    """Frames that another program on this computer publishes."""
 
     drone: Name = "drone"
-    """Whose frames: the name under which they are published."""
+    """The drone's name under which the frames are published."""
     connect: Annotated[tuple[Endpoint, ...], Field(min_length=1)] = ("tcp/127.0.0.1:7448",)
     """zenoh endpoints of the program that publishes them."""
     rate_hz: Annotated[float, Field(gt=0, le=1000)] = 10.0
-    """How often each camera's frames come; `safety.camera_timeout_periods` counts in these."""
+    """Rate of each camera's frames; its period is the unit of `safety.camera_timeout_periods`."""
     speed_factor: Annotated[float, Field(ge=0.02, le=10)] = 1.0
-    """How fast a simulator's time passes: at 0.5, half a second of it in each real one, and all of flockd's times and
-    time-outs count in it."""
+    """Speed of a simulator's time: at 0.5, half a simulated second passes in a real second. All times and time-outs of
+    flockd are in simulated time."""
 
 
 class SourceParameters(Section):
-    """Where camera frames come from, and how those of several cameras become sets."""
+    """The source of camera frames, and how frames of several cameras are combined into sets."""
 
     kind: Literal["v4l2", "gstreamer", "ros", "shared_memory"]
-    """Cameras of the kernel, GStreamer pipelines, topics of ROS 2, or another program's frames."""
+    """V4L2 devices, GStreamer pipelines, topics of ROS 2, or frames of another program."""
     cameras: tuple[CameraDeviceParameters, ...] = ()
-    """For all kinds but `shared_memory`: one for each camera of the rig."""
+    """One entry for each camera of the rig, for all kinds but `shared_memory`."""
     shared_memory: SharedMemoryParameters = SharedMemoryParameters()
     """For kind `shared_memory`."""
     set_tolerance_s: Annotated[float, Field(gt=0, le=60)] = 0.02
-    """How far the time stamp of a frame may be from that of its set; half a frame period or more."""
+    """Largest difference of time stamps between a frame and its set; at least half a frame period."""
     set_wait_s: Annotated[float, Field(gt=0, le=60)] = 0.1
-    """How long a set waits for a late or lost camera."""
+    """Time for which a set waits for a late or lost camera."""
     silence_s: Annotated[float, Field(gt=0, le=60)] = services.FRAME_SILENCE.timeout
     """A camera without a usable frame for this long is closed and opened again."""
     frozen_after: Annotated[int, Field(ge=0)] = 5
-    """An image that repeats itself this many times is frozen, and does not count; 0: it may repeat for ever."""
+    """After this many repetitions of one image the camera counts as frozen; 0: no limit."""
 
     @model_validator(mode="after")
     def _fits_its_kind(self) -> Self:
@@ -143,7 +144,7 @@ class SourceParameters(Section):
         return self
 
     def whole_px(self, camera: CameraDeviceParameters) -> tuple[int, int]:
-        """Width and height of the image that a camera's `crop` is cut from."""
+        """Width and height of the whole image that a camera's `crop` is a part of."""
         crops = [one.crop for one in self.cameras if one.place == camera.place and one.crop is not None]
         right, lower = (max(crop[axis] + crop[axis + 2] for crop in crops) for axis in (0, 1))
         return camera.crop_of or (right, lower)
@@ -193,7 +194,7 @@ _KEYS = {
     "gstreamer": ("pipeline",),
     "ros": ("topic", "camera_info", "stamps"),
 }
-"""Keys of a camera that only one kind of source has; the first says where the camera is."""
+"""Keys of a camera that only one kind of source has; the first one names the camera's place."""
 _LACKS = {
     "v4l2": "has no `device`; write the camera's path, as `flockd cameras` lists it",
     "gstreamer": "has no `pipeline`; write elements such as `v4l2src device=/dev/video0`",
@@ -202,7 +203,7 @@ _LACKS = {
 
 
 def _misplaced(camera: CameraDeviceParameters, kind: str) -> dict[tuple[str, ...], str]:
-    """What a camera of this kind of source must not have, by its key, or what it lacks."""
+    """Faults of a camera's keys for this kind of source: keys that it must not have, by key, or a missing one."""
     faults: dict[tuple[str, ...], str] = {
         (key,): f"is of a source of kind `{other}`; delete it, or write `kind: {other}`"
         for other, keys in _KEYS.items()

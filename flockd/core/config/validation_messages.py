@@ -1,4 +1,4 @@
-"""Messages for values that fail validation: one sentence for each place, with what to do."""
+"""Messages for values that fail validation: one sentence for each place, with the remedy."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ _LIMITS = {
 def problems_of(
     errors: Sequence[ErrorDetails], model: type[BaseModel], places: Mapping[KeyPath, Place]
 ) -> list[ConfigProblem]:
-    """One problem for each place of which the validation of `model` complained.
+    """One problem for each place at which `model` failed its validation.
 
-    Only the first ones by line, which are all that a person is shown, say what to do.
+    Only the first ones by line, which are shown to people, have a remedy.
     """
     root: Schema = model.model_json_schema()
     grouped: dict[KeyPath, list[ErrorDetails]] = {}
@@ -72,7 +72,7 @@ def _path_in_file(error: ErrorDetails, places: Mapping[KeyPath, Place]) -> KeyPa
 
 
 def _place(path: KeyPath, places: Mapping[KeyPath, Place]) -> Place:
-    """The path's place; for a missing key that of the section it belongs to."""
+    """The place of a path; for a missing key that of its section."""
     if path in places:
         return places[path]
     section = _place(path[:-1], places)
@@ -129,7 +129,7 @@ def _unknown_key(key: str, known: Sequence[str]) -> str:
 
 
 def _mend(value: object, schema: Schema, wanted: str) -> str:
-    """What to write instead of a value of the wrong type."""
+    """The remedy for a value of the wrong type."""
     numeric = schema.get("type") in {"number", "integer"}
     if isinstance(value, str) and numeric:
         for candidate in (value, value.replace("_", ""), value.replace(",", ".")):
@@ -153,7 +153,7 @@ def _mend(value: object, schema: Schema, wanted: str) -> str:
 
 
 def _is_within(number: float, schema: Schema) -> bool:
-    """Whether the schema's limits let it be."""
+    """Whether a value is within the schema's limits."""
     low, high = schema.get("minimum", -math.inf), schema.get("maximum", math.inf)
     over, under = schema.get("exclusiveMinimum", -math.inf), schema.get("exclusiveMaximum", math.inf)
     return bool(low <= number <= high and over < number < under)
@@ -175,7 +175,7 @@ def _unit(path: KeyPath) -> str:
 
 
 def _wanted(root: Schema, schema: Schema, unit: str) -> str:
-    """What a JSON schema asks for, in words."""
+    """A JSON schema's requirement in words."""
     schema = _resolved(root, schema)
     if "anyOf" in schema:
         return " or ".join(_wanted(root, branch, unit) for branch in schema["anyOf"])
@@ -219,7 +219,7 @@ def _wanted_number(schema: Schema, unit: str) -> str:
 
 
 def _choices(root: Schema, schema: Schema) -> list[str]:
-    """The words a value may be, where there are any."""
+    """The words that a value may be, if it has a fixed list of them."""
     schema = _resolved(root, schema)
     if "anyOf" in schema:
         return [choice for branch in schema["anyOf"] for choice in _choices(root, branch)]

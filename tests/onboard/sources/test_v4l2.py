@@ -310,11 +310,7 @@ ONE_GAIN = {GAIN: FakeControl(b"Gain", 0, 255, 64, step=16)}
         (FakeCamera(), {"controls": _controls(iris=1)}, "has no control 'iris'; it has auto_exposure, exposure_time_"),
         (FakeCamera(), {"controls": _controls(gain=300)}, "takes gain from 0 to 255, not 300"),
         (FakeCamera(), {"controls": BY_HAND[1:]}, "cannot set exposure_time_absolute to 50 (Permission denied)"),
-        (
-            FakeCamera(controls=ONE_GAIN),
-            {"controls": _controls(gain=40)},
-            "sets gain to 32 instead of 40; write a",
-        ),
+        (FakeCamera(controls=ONE_GAIN), {"controls": _controls(gain=40)}, "sets gain to 32 instead of 40; write"),
     ],
     ids=["size", "size to reduce", "rate", "metadata", "no such control", "range", "automatic on", "step"],
 )
