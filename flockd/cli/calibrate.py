@@ -202,12 +202,11 @@ def _import(args: argparse.Namespace) -> int:
         "your drone's file, measure the mountings, then run `flockd config check` on that.",
     )
     with written_whole(out) as draft:
-        draft.write_text(rig_text([camera for camera, _ in found], comment), encoding="utf-8")
-    result = {
-        "cameras": [
-            {**camera.model_dump(mode="json", exclude={"extrinsics"}), "off_deg": off} for camera, off in found
-        ],
-        "out": str(out),
-    }
+        draft.write_text(rig_text([one.camera for one in found], comment), encoding="utf-8")
+    cameras = [
+        {**one.camera.model_dump(mode="json", exclude={"extrinsics"}), "off_deg": one.off_deg, "rms_deg": one.rms_deg}
+        for one in found
+    ]
+    result = {"cameras": cameras, "out": str(out)}
     advice = "copy each camera's intrinsics into your drone's file, then run flockd config check on that"
     return say_facts(args, result, f"written: {out}; {advice}")

@@ -263,16 +263,19 @@ class WideAngleCamera(Camera):
         return slope
 
     def _theta(self, radius: FloatArray) -> FloatArray:
-        """Newton's method; NaN beyond the largest imaged angle."""
+        """Newton's method, by halves where it would leave what is known; NaN beyond the largest imaged angle."""
         limit = self._theta_limit
         theta = np.minimum(radius, limit)
         if self.distortion:
+            least, most = np.zeros_like(theta), np.full_like(theta, limit)
             with np.errstate(all="ignore"):
                 for _ in range(_NEWTON_STEPS):
                     error = self._radius(theta) - radius
                     if not np.nanmax(np.abs(error), initial=0.0) > _NEWTON_TOLERANCE:
                         break
-                    theta = np.clip(theta - error / self._slope(theta), 0.0, limit)
+                    least, most = np.where(error < 0.0, theta, least), np.where(error > 0.0, theta, most)
+                    step = theta - error / self._slope(theta)
+                    theta = np.where((step >= least) & (step <= most), step, (least + most) / 2.0)
         imaged = np.abs(self._radius(theta) - radius) < 1e-9
         return np.where(imaged, theta, np.nan)
 

@@ -86,6 +86,16 @@ def test_wide_angle_sees_behind_its_own_plane() -> None:
     assert np.allclose(camera.unproject(pixel, np.array([7.0])), point)
 
 
+def test_a_lens_whose_circle_is_wider_than_its_angle_has_rays_to_its_edge() -> None:
+    """Newton's method alone begins such a pixel at the turning point, where the slope is 0."""
+    lens = (0.118, -0.080, 0.082, -0.024)
+    theta = np.radians(np.linspace(1.0, 89.5, 60))  # turns at 90.2 degrees
+    radius = theta * (1 + sum(k * theta ** (2 * power) for power, k in enumerate(lens, start=1)))
+    assert radius.max() > np.radians(100.0)
+    pixels = MATRIX[:2, 2] + np.stack([300.0 * radius, np.zeros(60)], axis=1)
+    np.testing.assert_allclose(np.arccos(WideAngleCamera(MATRIX, SIZE, lens).rays(pixels)[:, 2]), theta, atol=1e-6)
+
+
 def test_what_lies_behind_a_pinhole_has_no_pixel_and_image_borders_are_half_open() -> None:
     camera = PINHOLES[0]
     pixels = camera.project(np.array([[0.0, 0.0, 5.0], [0.0, 0.0, -5.0], [1.0, 1.0, 0.0], [np.nan, 0.0, 1.0]]))
