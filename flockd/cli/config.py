@@ -136,7 +136,10 @@ def _check_file(file: Path, *, force: bool) -> None:
         problems += [*_yet_to_fill_in(config, places), *_settings_of_zenoh(config, places)]
     if problems:
         raise ConfigError(problems)
-    if not isinstance(config, ScenarioConfig):
+    if isinstance(config, ScenarioConfig):
+        for sentence in config.warnings():
+            complain(f"warning: {file}: {sentence}")
+    else:
         from flockd.ground.doctor import Level
         from flockd.ground.doctor.camera_checks import coverage, lens_problems
 

@@ -279,6 +279,8 @@ def _scenario(args: argparse.Namespace) -> ScenarioConfig:
         scenario = with_drones(scenario, drones)
     if all(vehicle.by_hand for vehicle in scenario.vehicles):
         raise UsageError(f"--drones {args.drones} leaves only drones that are flown by hand; fly more")
+    for sentence in scenario.warnings():
+        complain(f"warning: {sentence}")
     return scenario
 
 

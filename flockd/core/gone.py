@@ -108,6 +108,7 @@ KEYS: Mapping[str, str] = {
     "perception.flow_refinement_scale": "delete it: `dis` stops at half the size",
     "recording.file_mb": "delete it: a flight is one file",
     "stop": "delete it: all `seeds` are flown",
+    "rig.cameras.extrinsics.measured.residual_deg": "delete it: a flight tells mountings, with standard deviations",
     "safety.degraded_gusts_m_s": "write `degraded_velocity_error_m_s`",
     "safety.gate.max_drift_m_s": "delete it: wind is left to the autopilot",
     "tracking.first_acceleration_sigma_m_s2": "delete it: each neighbour may begin to manoeuvre harder at any time",

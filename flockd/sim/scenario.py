@@ -365,6 +365,17 @@ class ScenarioConfig(Section):
         """That of each vehicle, and whether it is flown by hand."""
         return [(self.drone_of(i).mission, vehicle.by_hand) for i, vehicle in enumerate(self.vehicles)]
 
+    def warnings(self) -> list[str]:
+        """What can be flown and is hardly meant: vehicles that begin out of sight of all others."""
+        sight_m, places = self.drone.perception.detection.max_range_m, [one.position_m for one in self.vehicles]
+        nearest_m = [min((dist(one, other) for other in places if other != one), default=0.0) for one in places]
+        return [
+            f"vehicles[{number}].position_m: begins {apart_m:.0f} m from the nearest other, and drones see others up "
+            f"to perception.detection.max_range_m, {sight_m:g} m; move it nearer, unless its mission does"
+            for number, apart_m in enumerate(nearest_m)
+            if apart_m > sight_m
+        ]
+
     @model_validator(mode="after")
     def _can_be_flown(self) -> Self:
         faults: dict[tuple[str | int, ...], str] = {}

@@ -45,4 +45,5 @@ def test_a_key_that_is_gone_is_refused_with_its_line_and_what_to_use(
     path.write_text(text, encoding="utf-8")
     (line,) = (number for number, one in enumerate(text.splitlines(), 1) if one.strip() == f"{name}: 1")
     assert main(["config", "check", str(path)]) == 78
-    assert f"{path}:{line}: {key.replace('faults.', 'faults[0].')}: is gone; {KEYS[key]}\n" in capsys.readouterr().err
+    shown = key.replace("faults.", "faults[0].").replace("rig.cameras.", "rig.cameras[0].")
+    assert f"{path}:{line}: {shown}: is gone; {KEYS[key]}\n" in capsys.readouterr().err

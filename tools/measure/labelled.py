@@ -6,8 +6,8 @@ python -m tools.measure.labelled found.json FOLDER/labels.json     # boxes in CO
 
 from __future__ import annotations
 
+import argparse
 import json
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -31,7 +31,7 @@ def read_labels(path: Path) -> dict[Path, list[Box]]:
 
     Raises SystemExit for boxes that cannot be of these pictures.
     """
-    coco = json.loads(path.read_text(encoding="utf-8-sig"))
+    coco = _json(path)
     drones = {one["id"] for one in coco["categories"] if one["name"].strip().casefold() in {"drone", "drones", "uav"}}
     if not drones:
         names = ", ".join(sorted(one["name"] for one in coco["categories"])) or "none"
@@ -137,6 +137,26 @@ def average_precision(judged: Sequence[tuple[float, bool]], boxes: int) -> float
     return float(np.sum(best * np.diff(hits[last] / boxes, prepend=0.0)))
 
 
+def _json(path: Path) -> Any:
+    return json.loads(path.read_text(encoding="utf-8-sig"))
+
+
+def _told(path: Path, read: Callable[[], Any], wanted: str) -> Any:
+    try:
+        return read()
+    except OSError as error:
+        raise SystemExit(f"{path}: cannot be read ({error.strerror}); name another file") from None
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise SystemExit(f"{path}: lacks or garbles {error}; give {wanted}") from None
+
+
 if __name__ == "__main__":
-    detected = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))["pictures"]
-    print(json.dumps(scored(detected, read_labels(Path(sys.argv[2]))), indent=1))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("found", type=Path, help="what `flockd detect --json` printed")
+    parser.add_argument("labels", type=Path, help="boxes in COCO's format")
+    args = parser.parse_args()
+    detected = _told(args.found, lambda: _json(args.found)["pictures"], "what `flockd detect --json` printed")
+    found = scored(detected, _told(args.labels, lambda: read_labels(args.labels), "boxes in COCO's format"))
+    if not found["measured"]:
+        raise SystemExit(f"{args.found}: has none of the pictures of {args.labels}; detect in the folder of the labels")
+    print(json.dumps(found, indent=1))

@@ -24,8 +24,6 @@ class MeasurementConfig(Section):
     """Number of views of a board, or of pairs of images of a scene."""
     residual_px: NonNegative | None = None
     """Root mean square of the fit's residuals."""
-    residual_deg: NonNegative | None = None
-    """The same for a fit to attitudes."""
 
 
 class IntrinsicsConfig(Section):

@@ -58,7 +58,7 @@ MAV_FRAME_LOCAL_NED = 1
 MAV_AUTOPILOT_PX4 = 12
 COMMAND_SET_MODE = 176
 COMMAND_SET_MESSAGE_INTERVAL = 511
-COMMAND_REQUEST_MESSAGE = 512
+FOR_ITS_VERSION = ("for its version", 512, 148)  # MAV_CMD_REQUEST_MESSAGE, AUTOPILOT_VERSION
 COMMAND_RUN_CHECKS = 401
 HEIGHT_GAIN_PER_S = 1.0
 """Climb rate of a setpoint for each metre of missing height."""
@@ -320,7 +320,7 @@ class AutopilotLink:
             elif self._clock() - version_s >= VERSION_AGAIN_S:
                 version_s = self._clock()
                 with suppress(AutopilotError):
-                    await self._command("for its version", COMMAND_REQUEST_MESSAGE, 148)
+                    await self._command(*FOR_ITS_VERSION)
             await asyncio.sleep(ATTEND_S)
 
     def _beginnings(self) -> int:
@@ -397,7 +397,7 @@ class AutopilotLink:
 
     async def firmware(self, timeout_s: float = 3.0) -> Firmware:
         """Its firmware. Raises AutopilotError without an answer within `timeout_s`."""
-        await self._command("for its version", COMMAND_REQUEST_MESSAGE, 148)
+        await self._command(*FOR_ITS_VERSION)
         number = int((await self._wait_for("AUTOPILOT_VERSION", self._clock() + timeout_s))["flight_sw_version"])
         kind = (await self._wait_for("HEARTBEAT", math.inf))["autopilot"]
         return Firmware(

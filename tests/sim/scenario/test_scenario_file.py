@@ -10,6 +10,7 @@ from random import Random
 import pytest
 
 from flockd.campaign.campaign_file import load_campaign
+from flockd.cli import main
 from flockd.core.config import DroneConfig, Overrides, load_drone
 from flockd.core.errors import ConfigError
 from flockd.flight.geometry import build_rig
@@ -121,6 +122,19 @@ def test_a_flight_that_cannot_be_flown_is_refused_at_its_line(tmp_path: Path, ol
     scenario.write_text(text, encoding="utf-8")
     (problem,) = problems_in(scenario, load_scenario)
     assert str(problem).startswith(f"scenario.yaml:{told}")
+
+
+def test_drones_that_begin_out_of_sight_are_warned_of(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The third is 500 m away; 60 m is `perception.detection.max_range_m`."""
+    (tmp_path / "drone.yaml").write_text(DRONE, encoding="utf-8")
+    (scenario := tmp_path / "two.yaml").write_text(SCENARIO, encoding="utf-8")
+    assert main(["config", "check", str(scenario)]) == 0
+    assert not capsys.readouterr().err
+    scenario.write_text(SCENARIO + "  - {position_m: [400, 305, -4]}\n", encoding="utf-8")
+    assert main(["config", "check", str(scenario)]) == 0
+    (warned,) = capsys.readouterr().err.splitlines()
+    assert warned.startswith(f"warning: {scenario}: vehicles[2].position_m: begins 500 m from the nearest other, ")
+    assert "perception.detection.max_range_m, 60 m" in warned
 
 
 def test_files_of_another_kind_are_refused_with_what_to_name(tmp_path: Path) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import runpy
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -59,3 +61,36 @@ def test_pictures_with_and_without_drones_and_one_without_labels(tmp_path: Path)
     assert found["by_width"].pop("12-30") == {"boxes": 3, "found": 2}
     assert set(map(str, found.pop("by_width").values())) == {"{'boxes': 0, 'found': 0}"}
     assert found == {"boxes": 3, "ap50": round(1 / 3, 4), "measured": 4, "false": 2, "false_per_picture": 0.5}
+
+
+@pytest.mark.parametrize(
+    ("found", "labels", "told"),
+    [
+        ('{"pictures": []}', "{}", "labels.json: lacks or garbles 'categories'; give boxes in COCO's format"),
+        (
+            "[]",
+            "{}",
+            "found.json: lacks or garbles list indices must be integers or slices, not str; give what `flockd",
+        ),
+        ("pictures", "{}", "found.json: lacks or garbles Expecting value: line 1 column 1 (char 0); give what `flockd"),
+        (
+            '{"pictures": []}',
+            '{"categories": [{"id": 1, "name": "drone"}], "images": [], "annotations": []}',
+            "found.json: has none of the pictures of ",
+        ),
+    ],
+)
+def test_what_cannot_be_measured_is_told_in_a_sentence(
+    found: str, labels: str, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files = [tmp_path / "found.json", tmp_path / "labels.json"]
+    for file, text in zip(files, (found, labels), strict=True):
+        file.write_text(text, encoding="utf-8")
+    monkeypatch.setattr("sys.argv", ["labelled", *map(str, files)])
+    with pytest.raises(SystemExit) as ended, warnings.catch_warnings(action="ignore"):  # that it is imported already
+        runpy.run_module("tools.measure.labelled", run_name="__main__")
+    assert told in str(ended.value)
+    monkeypatch.setattr("sys.argv", ["labelled", "--help"])
+    with pytest.raises(SystemExit) as ended, warnings.catch_warnings(action="ignore"):
+        runpy.run_module("tools.measure.labelled", run_name="__main__")
+    assert ended.value.code == 0
