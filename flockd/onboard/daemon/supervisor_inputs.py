@@ -19,7 +19,7 @@ from flockd.onboard.daemon.operator_orders import OperatorRequests
 from flockd.onboard.daemon.pilot_loop import PilotLoop
 from flockd.onboard.daemon.watched_networks import WatchedNetworks
 from flockd.onboard.sources import CameraStatus, Count, FrameSource
-from flockd.onboard.worker import LateError, Worker
+from flockd.onboard.worker import BusyError, LateError, Worker
 
 DROPS_WINDOW_S = 5.0
 _Tally = tuple[int, int, int, int]
@@ -194,7 +194,8 @@ def _dropped_share(before: _Tally, now: _Tally) -> float:
 SAMPLE_S = 0.05
 MEMORY_S = 1.0
 THERMAL_ZONES = Path("/sys/class/thermal")
-READ_DEADLINE_S = 1.0
+READ_EVERY_S = 1.0
+"""Time between two readings of the temperature, and for one."""
 
 
 class LoopLag:
@@ -234,13 +235,11 @@ class Thermometer:
         try:
             while True:
                 try:
-                    zones = await worker.do(READ_DEADLINE_S, thermal_zones)
+                    zones = await worker.do(READ_EVERY_S, thermal_zones)
                     self.hottest_c = max((celsius for _, celsius in zones), default=None)
-                except LateError:
+                except (LateError, BusyError):  # a driver may hang for ever, so no further thread waits for it
                     self.hottest_c = None
-                    worker.leave()
-                    worker = Worker("thermometer")
-                await asyncio.sleep(1.0)
+                await asyncio.sleep(READ_EVERY_S)
         finally:
             worker.leave()
 

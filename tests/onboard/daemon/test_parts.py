@@ -51,13 +51,14 @@ from flockd.onboard.daemon.pilot_loop import (
     last_seen_s,
 )
 from flockd.onboard.daemon.status import ServiceManager
-from flockd.onboard.daemon.supervisor_inputs import CameraMonitor, InputCollector, LoopLag, thermal_zones
+from flockd.onboard.daemon.supervisor_inputs import CameraMonitor, InputCollector, LoopLag, Thermometer, thermal_zones
 from flockd.onboard.daemon.watched_networks import NetworkStuckError, WatchedNetworks
 from flockd.onboard.recording import Recorder
 from flockd.onboard.sources import CameraStatus, Count
 from flockd.onboard.worker import Worker
 from flockd.sim.sitl.processes import free_endpoint
 from tests.make import around, autopilot_status, camera, changed, drone, neighbour, output, vehicle, wanted
+from tests.onboard.autopilot.flight import until
 from tests.onboard.daemon.aboard import TinyPerceiver, config_for
 
 IMAGE = np.zeros((48, 64, 3), np.uint8)
@@ -143,6 +144,31 @@ def test_a_thermal_zone_that_cannot_be_read_does_not_count(tmp_path: Path) -> No
         (tmp_path / f"thermal_zone{number}" / "temp").write_text(reading, encoding="ascii")
         (tmp_path / f"thermal_zone{number}" / "type").write_text("cpu\n", encoding="ascii")
     assert thermal_zones(tmp_path) == [("cpu", 41.5), ("cpu", 67.25)]
+
+
+async def test_a_temperature_that_cannot_be_read_costs_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With one for each attempt, the service's TasksMax would end the flight after some minutes."""
+    hangs, answers = threading.Event(), threading.Event()
+
+    def zones() -> list[tuple[str, float]]:
+        if hangs.is_set():
+            answers.wait()
+        return [("cpu", 41.5)]
+
+    monkeypatch.setattr("flockd.onboard.daemon.supervisor_inputs.thermal_zones", zones)
+    monkeypatch.setattr("flockd.onboard.daemon.supervisor_inputs.READ_EVERY_S", 0.02)
+    thermometer = Thermometer()
+    reading = asyncio.create_task(thermometer.run())
+    await until(lambda: thermometer.hottest_c == 41.5)
+    hangs.set()
+    await until(lambda: thermometer.hottest_c is None)
+    for _ in range(5):
+        await asyncio.sleep(0.05)
+    assert [thread.name for thread in threading.enumerate()].count("thermometer") == 1
+    hangs.clear()
+    answers.set()
+    await until(lambda: thermometer.hottest_c == 41.5)
+    reading.cancel()
 
 
 def test_a_blocked_event_loop_is_seen_while_it_is_and_after() -> None:
