@@ -63,9 +63,8 @@ def _add_options(parser: Parser) -> Parser:
 
 def _list(args: argparse.Namespace) -> int:
     from flockd.flight.inference import load_manifest
-    from flockd.flight.perception.requirements import check_roles
 
-    models = [load_manifest(path, check_roles) for path in _manifests(args.dir)]
+    models = [load_manifest(path) for path in _manifests(args.dir)]
     if args.json:
         say_json([model.model_dump(mode="json") for model, _ in models])
         return ExitCode.DONE
@@ -82,13 +81,12 @@ def _list(args: argparse.Namespace) -> int:
 
 def _verify(args: argparse.Namespace) -> int:
     from flockd.flight.inference import OnnxModel
-    from flockd.flight.perception.requirements import check_roles
     from flockd.onboard.worker import GOLDEN_S, within
 
     faults: dict[str, str | None] = {}
     for path in _manifests(args.dir):
         try:
-            OnnxModel(path, threads=THREADS, check=check_roles, deadline=within(GOLDEN_S))
+            OnnxModel(path, threads=THREADS, deadline=within(GOLDEN_S))
         except ModelError as error:
             faults[path.stem] = str(error)
         else:
@@ -137,14 +135,12 @@ def _prepare_one(path: Path, config: DroneConfig) -> dict[str, Any]:
     from flockd.flight.inference.feeds import feeds_for, golden_feeds, shapes_of
     from flockd.flight.inference.providers import BUILD_ENGINES, engines_folder
     from flockd.flight.perception.onnx import CROPS_PER_RUN
-    from flockd.flight.perception.requirements import check_roles
 
     wanted = config.perception
     options: Any = {
         "threads": wanted.threads,
         "provider": wanted.provider,
         "engines": engines_folder(wanted),
-        "check": check_roles,
     }
     begun_s = time.perf_counter()
     if wanted.provider in BUILD_ENGINES:

@@ -100,6 +100,7 @@ KEYS: Mapping[str, str] = {
     "geometry.min_drone_pairs": "delete it: the tracker finds velocities from bearings and ranges alone",
     "geometry.neighbour_velocity_caution": "delete it: the tracker finds velocities from bearings and ranges alone",
     "perception.detection.colour_weight": "delete it: masks are the first stage's",
+    "perception.detection.depth_map_sigma": "delete it: `perception.distance` gives every range",
     "perception.detection.max_residuals": "delete it: only what is segmented or predicted is proposed",
     "perception.detection.occlusion": "delete it: the nearer of two does not hide the farther any more",
     "perception.detection.prediction_gate": "delete it: what is found where a track was predicted counts as all else",
@@ -122,6 +123,11 @@ KEYS: Mapping[str, str] = {
     "safety.max_ego_motion_failures": "write `max_ego_motion_s`, in seconds instead of steps",
 }
 """By a drone's, scenario's or campaign's key, with dots, and without `drone` before those of a drone in a scenario."""
+
+MANIFEST_KEYS: Mapping[str, str] = {
+    "outputs.depth.unknown": "choose a depth network that gives metres: most relative ones have a metric version",
+}
+"""By a manifest's key, without the name of an output."""
 
 VALUES = (("flocking.size", "auto"), ("flocking.size", "weave"))
 """Keys and their values that recordings of earlier versions hold, and that this one takes for the default."""

@@ -25,11 +25,10 @@ from onnx import TensorProto, helper, numpy_helper
 from flockd.core.data import data_path
 from flockd.core.errors import ModelError, UsageError
 from flockd.flight.inference import load_manifest
-from flockd.flight.inference.checks import cannot_run
 from flockd.flight.inference.feeds import golden_feeds
 from flockd.flight.inference.manifest_file import read_manifest
 from flockd.flight.inference.providers import open_runtime
-from flockd.flight.perception.requirements import check_roles
+from flockd.flight.inference.session import cannot_run
 from flockd.ground.manifest_writer import write_manifest, write_unchecked
 
 STRIDES = (8, 16, 32, 64)
@@ -285,7 +284,7 @@ def _manifest(file: Path, kind: _Kind, name: str, drone: str, licence: str, said
 
 def _checked(file: Path, manifest: dict[str, Any], there: Path) -> dict[str, NDArray[Any]]:
     """The output for the golden picture. Raises ModelError where it cannot be what the kind of network gives."""
-    opened = read_manifest(write_unchecked(manifest, there), check_roles)
+    opened = read_manifest(write_unchecked(manifest, there))
     runtime = open_runtime(opened, threads=1, provider="cpu", folder=None)
     try:
         (boxes,) = runtime.run(["boxes"], golden_feeds(opened.manifest))

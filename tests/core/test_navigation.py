@@ -9,7 +9,7 @@ import pytest
 
 from flockd.core.messages import Setpoint, Wanted
 from flockd.core.navigation import wrapped
-from flockd.flight.mission import Guidance
+from flockd.flight.mission.guidance import Guidance
 
 DEGREES = [
     (0, 0), (90, 90), (-90, -90), (180, 180), (-180, 180), (181, -179), (359, -1), (360, 0), (450, 90), (-450, -90),

@@ -15,7 +15,6 @@ from onnx import TensorProto, helper, numpy_helper
 
 from flockd.cli import main
 from flockd.flight.inference import OnnxModel
-from flockd.flight.perception.requirements import check_roles
 from flockd.ground.calibration.fragment import rig_text
 from tests import make
 from tests.ground.pictures.photographs import FOCAL_PX, RENDERED, SIZE, truth
@@ -125,7 +124,7 @@ def test_each_kind_gives_the_drone_where_it_is(
     assert (told["manifest"], told["kind"], told["drone"]) == (str(path), kind, "drone")
     assert "says 'AGPL-3.0 License (https://ultralytics.com/license)': whoever gets a drone, or" in captured.err
     assert file.read_bytes() == before
-    model = OnnxModel(path, threads=1, check=check_roles)
+    model = OnnxModel(path, threads=1)
     rows = model.infer({"image": [np.zeros((SIDE, SIDE, 3), np.uint8)]})["boxes"]
     best = rows[rows[:, 4].argmax()]
     assert best == pytest.approx([*DRONE, P], rel=2e-3)

@@ -147,7 +147,7 @@ def test_an_interrupted_fleet_lands_and_leaves_a_report_of_what_was_flown(tmp_pa
 def test_a_daemon_that_does_not_come_up_ends_the_flight_with_its_own_words(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    scenario = _scenario(tmp_path, drones=1, perception={"flow": "dis", "distance": "none", "depth": "nothing"})
+    scenario = _scenario(tmp_path, drones=1, perception={"flow": "dis", "depth": "nothing"})
     assert main(["sim", str(scenario), "--autopilot", "fake", "--out", str(tmp_path / "out")]) == 69
     last = capsys.readouterr().err.splitlines()[-1]
     assert last.startswith("drone1 ended with exit code 78 (")

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockd.flight.inference import OnnxModel
-from flockd.flight.perception.requirements import check_roles
 from tools.training.pictures import is_aimed
 
 Array = NDArray[Any]
@@ -41,7 +40,7 @@ def held_out(folder: Path) -> tuple[dict[str, Array], Array]:
 
 def measured(manifest: Path, crops: dict[str, Array], none: Array) -> dict[str, str]:
     """Figures of a network by what they are; relative errors of range are of one crop, without the cascade's mean."""
-    model = OnnxModel(manifest, threads=1, check=check_roles)
+    model = OnnxModel(manifest, threads=1)
     out, no = _columns(model, crops["picture"]), _columns(model, none)
     log_range, range_m = crops["target"][:, 0], crops["range_m"]
     error = np.expm1(out["log_range_per_focal"] - log_range)
@@ -58,7 +57,7 @@ def measured(manifest: Path, crops: dict[str, Array], none: Array) -> dict[str, 
     of_size = np.exp(out["log_size_sigma"]) if "log_size_sigma" in out else 0.0
     sigmas = np.abs(out["log_range_per_focal"] - log_range) / np.hypot(np.exp(out["log_relative_sigma"]), of_size)
     figures["errors inside 1 and 2 sigma"] = f"{np.mean(sigmas < 1):.0%}, {np.mean(sigmas < 2):.0%}"
-    least = np.log(1 / (1 / model.manifest.threshold("drone_probability") - 1))
+    least = np.log(1 / (1 / model.manifest.thresholds["drone_probability"] - 1))
     figures["drones called a drone"] = f"{np.mean(out['drone_logit'] > least):.1%}"
     figures["crops without a drone called one"] = f"{np.mean(no['drone_logit'] > least):.1%}"
     return figures

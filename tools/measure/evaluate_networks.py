@@ -22,7 +22,7 @@ from flockd.core.choices import ROLES, ScaleSource
 from flockd.core.config.perception import PerceptionConfig
 from flockd.core.data import data_path
 from flockd.core.messages import UNCLASSED, Detection, Frame, FrameSet, VehicleState
-from flockd.flight.geometry import RangeMap, Rig, RigCamera, z_map
+from flockd.flight.geometry import RangeMap, Rig, RigCamera
 from flockd.flight.perception import DisFlow, OnnxNetworks, Perception
 from flockd.flight.perception.detection.detector import DetectionTrace
 from flockd.flight.pilot.ground import level_ground
@@ -200,7 +200,7 @@ def depth_errors(ranges: RangeMap, camera: RigCamera, true: Array, ids: Array) -
 
     ``true`` (h / 2, w / 2) metres along the optical axis, as rendered; ``ids`` alike, 0 where there is no drone.
     """
-    guess = z_map(ranges, camera.camera)[1::2, 1::2]
+    guess = (ranges * camera.camera.block_rays(1)[..., 2])[1::2, 1::2]
     near = (ids == 0) & (true < 60.0)
     return np.asarray(np.abs(guess[near] - true[near]) / true[near])
 

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from flockd.flight.inference import OnnxModel
 from flockd.flight.perception import group_instances
 from flockd.flight.perception.detection.boxes import BoxRules, kept_boxes, probable_boxes
-from flockd.flight.perception.requirements import check_roles
 from tools.training.dataset import PairSet, ground_plane, open_pairs, ray_tangents
 from tools.training.pictures import PROPOSALS, pictures_in, read
 
@@ -36,7 +35,7 @@ def main() -> None:
     parser.add_argument("data", type=Path)
     parser.add_argument("--model", type=Path, required=True, help="manifest of a neighbours network or of a detector")
     arguments = parser.parse_args()
-    model, data = OnnxModel(arguments.model, threads=1, check=check_roles), arguments.data
+    model, data = OnnxModel(arguments.model, threads=1), arguments.data
     if (data / "worlds").is_dir():
         found = mined(open_pairs(data / "worlds"), model)
         np.save(data / "worlds" / "negatives.npy", found)
@@ -95,7 +94,7 @@ def proposed(
             v, u = np.mgrid[0.5:height, 0.5:width].astype(np.float32)
             planes = np.stack([(u - width / 2) / (width / 2), (v - height / 2) / (width / 2), np.zeros_like(u)])
         out = model.run({"image": image[None], "geometry": planes[None]})
-        logit = out["drone"][0, 0] - np.float32(manifest.threshold("proposal_logit"))
+        logit = out["drone"][0, 0] - np.float32(manifest.thresholds["proposal_logit"])
         boxes = np.array(
             [one.box for one in group_instances(logit, out["offset"][0], scale=manifest.map_stride or 1)[1]]
         )

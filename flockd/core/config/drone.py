@@ -19,7 +19,7 @@ from flockd.core.config.base import Endpoint, Name, Positive, Section, refuse
 from flockd.core.config.flocking import FlockingParameters
 from flockd.core.config.geometry import GeometryParameters
 from flockd.core.config.mission import MissionParameters, mission_faults
-from flockd.core.config.perception import NO_MODEL, PerceptionConfig
+from flockd.core.config.perception import PerceptionConfig
 from flockd.core.config.rig import RigConfig
 from flockd.core.config.safety import SafetyParameters
 from flockd.core.config.source import CameraDeviceParameters, SourceParameters
@@ -121,8 +121,6 @@ class DroneConfig(Section):
             faults["flocking", "desired_distance_m"] = f"{self.flocking.desired_distance_m:g} {told}"
         if self.flocking.size == "learn" and self.perception.drone_size_m is not None:
             faults["flocking", "size"] = "learns what perception.drone_size_m says; delete one of the two"
-        elif self.flocking.size == "learn" and self.perception.distance == NO_MODEL:
-            faults["flocking", "size"] = "needs the apparent size; name a second stage in perception.distance"
         if self.speed_factor != 1.0 and self.autopilot is not None and self.autopilot.address.startswith("serial:"):
             fault = "is for simulations, and an autopilot on a cable is none; delete it"
             faults["source", "shared_memory", "speed_factor"] = fault

@@ -11,7 +11,7 @@ from flockd.core.choices import ROLES, FlowRefinement, HeightSource, Provider, R
 from flockd.core.config.base import Distance, NonNegative, Positive, Section, Share, refuse
 
 DIS, NO_MODEL = "dis", "none"
-"""Stands in the place of a model's name: OpenCV's DIS flow, and no second stage."""
+"""Stand in the place of a model's name: OpenCV's DIS flow, and no network."""
 
 MIN_DRONE_SIZE_M, MAX_DRONE_SIZE_M = 0.05, 5.0
 """Limits of a drone's size from tip to tip: less is a toy that the networks do not find, more is an aircraft."""
@@ -41,8 +41,6 @@ class DetectionParameters(Section):
     image does not exceed the deadline. It must be above the number of drones that one camera sees."""
     mask_border_px: Annotated[int, Field(ge=0)] = 5
     """Border around masks in which background is not used, because masks and depth maps are uncertain there."""
-    depth_map_sigma: Positive = 0.08
-    """Standard deviation of a drone's log range from the depth map alone (`perception.distance: none`)."""
 
 
 class NoiseParameters(Section):
@@ -111,7 +109,7 @@ class PerceptionConfig(Section):
     detector: str = "detector"
     """Boxes of drones in the whole image. `none`: only the segmentation makes proposals."""
     distance: str = "distance_int8"
-    """Second stage: a drone's range from its crop. `none`: the range comes from the depth map."""
+    """Second stage: a drone's range from its crop."""
     verification: str = "verification_int8"
     """Second stage: the probability that a crop shows a drone. `none`: it comes from the distance network alone."""
     models_dir: str | None = None
@@ -146,8 +144,6 @@ class PerceptionConfig(Section):
         if size is None:
             return self
         faults: dict[tuple[str | int, ...], str] = {}
-        if self.distance == NO_MODEL:
-            faults["drone_size_m",] = "needs the apparent size, which a second stage gives; name one in `distance`"
         if self.drone_size_sigma_m > MAX_SIZE_SIGMA * size:
             faults["drone_size_sigma_m",] = (
                 f"{self.drone_size_sigma_m:g} m is more than {MAX_SIZE_SIGMA:.0%} of drone_size_m, {size:g} m; "
@@ -159,6 +155,5 @@ class PerceptionConfig(Section):
     @property
     def networks(self) -> dict[Role, str]:
         """The model's name, or its manifest's path, of each role that a network fills."""
-        unused = {"detector", "verification"} if self.distance == NO_MODEL else set()
-        names = {role: getattr(self, role) for role in ROLES if role not in unused}
+        names = {role: getattr(self, role) for role in ROLES}
         return {role: name for role, name in names.items() if name not in {DIS, NO_MODEL}}

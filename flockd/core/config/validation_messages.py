@@ -14,7 +14,7 @@ from pydantic_core import ErrorDetails
 from flockd.core.config.base import WORDS
 from flockd.core.config.document import KeyPath, Place, core_scalar
 from flockd.core.errors import MAX_PROBLEMS_TOLD, ConfigProblem
-from flockd.core.gone import KEYS
+from flockd.core.gone import KEYS, MANIFEST_KEYS
 
 Schema = dict[str, Any]
 
@@ -88,7 +88,9 @@ def _sentence(errors: Sequence[ErrorDetails], place: Place, path: KeyPath, root:
     wanted = _wanted(root, schema, _unit(path))
     shown = place.written or ("a list" if isinstance(value, tuple) else _shown(value))
     if kind == "extra_forbidden":
-        gone = KEYS.get(".".join(part for part in path if isinstance(part, str)).removeprefix("drone."))
+        keys = ".".join(part for part in path if isinstance(part, str))
+        of_manifest = MANIFEST_KEYS.get(re.sub(r"^outputs\.[^.]*\.", "outputs.", keys))
+        gone = KEYS.get(keys.removeprefix("drone."), of_manifest)
         if gone is not None:
             return f"is gone; {gone}"
         section = _with_parts(root, _schema_at(root, path[:-1]))

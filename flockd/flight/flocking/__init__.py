@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from flockd.core.config.flocking import FlockingParameters, WeightParameters
+from flockd.core.config.flocking import FlockingParameters
 from flockd.flight.flocking.law import FlockingLaw, level_offsets, lookahead_s
 
 __all__ = [
     "FlockingLaw",
     "FlockingParameters",
-    "WeightParameters",
     "level_offsets",
     "lookahead_s",
 ]

@@ -1,16 +1,15 @@
 """Camera models, rigid fits, Algorithm 1, ego- and neighbour motion. Pure and deterministic: no clock, no files."""
 
 from flockd.flight.geometry.cameras import Camera, PinholeCamera, WideAngleCamera
-from flockd.flight.geometry.depth_maps import RangeMap, ZMap, range_map, z_map
+from flockd.flight.geometry.depth_maps import RangeMap, ZMap, range_map
 from flockd.flight.geometry.ego_motion import estimate_ego_motion, moved_pixels
-from flockd.flight.geometry.ego_motion_refinement import refine_ego_motion
 from flockd.flight.geometry.ground import ground_inverse_depth
 from flockd.flight.geometry.ground_fit import GroundSamples, fit_ground
 from flockd.flight.geometry.pairs import PointPairs, grid_pixels, lift_matches
 from flockd.flight.geometry.polar import log_polar, log_polar_covariance, log_polar_residual
 from flockd.flight.geometry.rig import Rig, RigCamera, build_rig
 from flockd.flight.geometry.rigid_fit import fit_rigid
-from flockd.flight.geometry.robust.ransac import RansacResult, ransac_rigid
+from flockd.flight.geometry.robust.ransac import ransac_rigid
 from flockd.flight.geometry.rotations import (
     euler_from_rotation,
     quaternion_from_rotation,
@@ -30,7 +29,6 @@ __all__ = [
     "PinholeCamera",
     "PointPairs",
     "RangeMap",
-    "RansacResult",
     "Rig",
     "RigCamera",
     "RigidTransform",
@@ -53,12 +51,10 @@ __all__ = [
     "quaternion_from_rotation",
     "range_map",
     "ransac_rigid",
-    "refine_ego_motion",
     "rotation_angle_deg",
     "rotation_from_euler",
     "rotation_from_quaternion",
     "rotation_from_vector",
     "vector_from_rotation",
     "virtual_crops",
-    "z_map",
 ]

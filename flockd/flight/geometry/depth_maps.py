@@ -21,11 +21,6 @@ def range_map(z: ZMap, camera: Camera) -> RangeMap:
     return RangeMap(z / _axial_share(camera))
 
 
-def z_map(ranges: RangeMap, camera: Camera) -> ZMap:
-    """The inverse of `range_map`, for output."""
-    return ZMap(ranges * _axial_share(camera))
-
-
 @lru_cache(maxsize=32)
 def _axial_share(camera: Camera) -> Float32Array:
     """(h, w) z over range of each pixel; NaN outside the lens's image, or if it is not positive."""

@@ -9,7 +9,7 @@ import numpy as np
 from flockd.core.config.geometry import GeometryParameters
 from flockd.core.messages import EgoMotion, FloatArray
 from flockd.flight.geometry.ego_motion_refinement import refine_ego_motion
-from flockd.flight.geometry.pairs import BACKGROUND_LABEL, PointPairs
+from flockd.flight.geometry.pairs import PointPairs
 from flockd.flight.geometry.rig import Rig, RigCamera
 from flockd.flight.geometry.robust.ransac import ransac_rigid
 from flockd.flight.geometry.transform import RigidTransform
@@ -31,43 +31,39 @@ class EgoMotionAcceptance:
 ACCEPTANCE = EgoMotionAcceptance()
 
 
-def estimate_ego_motion(
-    pairs: PointPairs, rig: Rig, interval_s: float, parameters: GeometryParameters, *, seed: int = 0
-) -> EgoMotion:
-    """``P_C = R_FC P_F + T_FC`` (Eq. 7) from the pairs labelled background, of all cameras together.
+def estimate_ego_motion(pairs: PointPairs, rig: Rig, interval_s: float, parameters: GeometryParameters) -> EgoMotion:
+    """``P_C = R_FC P_F + T_FC`` (Eq. 7) from the background pairs of all cameras together.
 
     By Algorithm 1. With ``parameters.refine`` its reprojection error is then minimised; if that fails or loses matches,
     the result of Algorithm 1 is kept. ``inliers`` and ``threshold_m`` are Algorithm 1's. Raises ValueError with the
     reason if there is no estimate, or if it explains too few of its matches.
     """
-    background = pairs.select(pairs.labels == BACKGROUND_LABEL)
     found = ransac_rigid(
-        background.current,
-        background.previous,
+        pairs.current,
+        pairs.previous,
         threshold=parameters.initial_threshold_m,
         min_inlier_ratio=parameters.min_inlier_ratio,
         hypotheses=parameters.hypotheses,
         max_threshold=parameters.max_threshold_m,
-        seed=seed,
     )
     motion = found.transform
-    by_camera = [(camera, background.select(background.camera_names == name)) for name, camera in rig.cameras.items()]
-    explained = _explained(by_camera, motion) / len(background)
+    by_camera = [(camera, pairs.select(pairs.camera_names == name)) for name, camera in rig.cameras.items()]
+    explained = _explained(by_camera, motion) / len(pairs)
     if parameters.refine:
-        refined = refine_ego_motion(background, rig, motion, agreeing=found.inliers, seed=seed)
-        still = _explained(by_camera, refined) / len(background) if refined else 0.0
+        refined = refine_ego_motion(pairs, rig, motion, found.inliers)
+        still = _explained(by_camera, refined) / len(pairs) if refined else 0.0
         if refined and still >= ACCEPTANCE.min_kept * explained:
             motion, explained = refined, still
     if explained < ACCEPTANCE.min_explained:
         raise ValueError(
-            f"the best motion explains only {explained:.1%} of {len(background)} matches within "
+            f"the best motion explains only {explained:.1%} of {len(pairs)} matches within "
             f"{ACCEPTANCE.explained_px:g} px"
         )
     return EgoMotion(
         rotation=motion.rotation,
         translation=motion.translation,
         interval_s=interval_s,
-        pairs=len(background),
+        pairs=len(pairs),
         inliers=int(found.inliers.sum()),
         threshold_m=found.threshold,
     )

@@ -34,12 +34,7 @@ _MAX_CONDITION = 1e12
 
 
 def refine_ego_motion(
-    pairs: PointPairs,
-    rig: Rig,
-    initial: RigidTransform,
-    *,
-    agreeing: BoolArray | None = None,
-    seed: int = 0,
+    pairs: PointPairs, rig: Rig, initial: RigidTransform, agreeing: BoolArray
 ) -> RigidTransform | None:
     """The motion near ``initial`` (F to C) that best reprojects the pairs; None if there is no better one.
 
@@ -51,9 +46,8 @@ def refine_ego_motion(
 
     None: the steps did not converge or the robust cost did not fall.
     """
-    agreeing = np.ones(len(pairs), np.bool_) if agreeing is None else agreeing
     if len(pairs) > _MAX_PAIRS:
-        drawn = np.sort(np.random.default_rng(seed).choice(len(pairs), _MAX_PAIRS, replace=False))
+        drawn = np.sort(np.random.default_rng(0).choice(len(pairs), _MAX_PAIRS, replace=False))
         pairs, agreeing = pairs.select(drawn), agreeing[drawn]
     typical = np.concatenate([agreeing, agreeing])  # both ways
     if not typical.any():

@@ -1,4 +1,4 @@
-"""From flow and depth maps to paired points in the body frame, each with its class."""
+"""From flow and depth maps to paired background points in the body frame."""
 
 from __future__ import annotations
 
@@ -13,23 +13,18 @@ from flockd.core.messages import BoolArray, Float32Array, FloatArray, IntArray
 from flockd.flight.geometry.depth_maps import RangeMap
 from flockd.flight.geometry.rig import RigCamera
 
-BACKGROUND_LABEL = 0
-"""The class of all that does not move; drones have labels from 1 up."""
-
 _DEPTH_AGREEMENT = 0.05
 """Neighbouring depths that differ by more are of two surfaces and are not interpolated."""
 
 
 @dataclass(frozen=True, eq=False)
 class PointPairs:
-    """n points seen at an interval's start (in body frame C) and at its end (in body frame F)."""
+    """n background points seen at an interval's start (in body frame C) and at its end (in body frame F)."""
 
     previous: FloatArray
     """(n, 3) metres in C."""
     current: FloatArray
     """(n, 3) metres in F."""
-    labels: IntArray
-    """(n,)"""
     camera_names: NDArray[np.str_]
     """(n,) the camera that saw each point, both times."""
     pixels_previous: FloatArray
@@ -78,9 +73,9 @@ def lift_matches(
     """Matches ``p -> p + flow(p)`` of one camera as pairs of points in the body frame (Eq. 6, then the extrinsics).
 
     ``pixels`` (n, 2) of the previous image; all maps have the camera's size: ``flow`` (h, w, 2) pixels, depths (h, w)
-    metres along the ray, labels (h, w) integers. A pair is dropped if an end lies outside the image, its depth is not
-    finite, not positive or above ``max_depth_m``, or the labels of both ends differ. Raises ValueError for a map of
-    another size.
+    metres along the ray, labels (h, w) integers, 0 of the background. A pair is dropped if an end lies outside the
+    image or the background, or its depth is not finite, not positive or above ``max_depth_m``. Raises ValueError for a
+    map of another size.
     """
     width, height = camera.camera.size
     maps = (flow[..., 0], depth_previous, depth_current, labels_previous, labels_current)
@@ -91,13 +86,12 @@ def lift_matches(
     pixels_current = pixels_previous + _nearest(flow, pixels_previous)
     inside = camera.camera.in_image(pixels_current).nonzero()[0]
     pixels_previous, pixels_current = pixels_previous.take(inside, axis=0), pixels_current.take(inside, axis=0)
-    labels = _nearest(labels_previous, pixels_previous)
     range_previous = _sample_depth(depth_previous, pixels_previous)
     range_current = _sample_depth(depth_current, pixels_current)
     # NaN compares false, so depths that are not finite are dropped too.
     kept = (range_previous > 0.0) & (range_previous <= max_depth_m)
     kept &= (range_current > 0.0) & (range_current <= max_depth_m)
-    kept &= labels == _nearest(labels_current, pixels_current)
+    kept &= (_nearest(labels_previous, pixels_previous) == 0) & (_nearest(labels_current, pixels_current) == 0)
     previous = camera.camera.unproject(pixels_previous, range_previous)
     current = camera.camera.unproject(pixels_current, range_current)
     # Outside a fisheye's image circle there is no ray.
@@ -105,7 +99,6 @@ def lift_matches(
     return PointPairs(
         previous=camera.T_body_camera.apply(previous.take(places, axis=0)),
         current=camera.T_body_camera.apply(current.take(places, axis=0)),
-        labels=labels[places].astype(np.int64),
         camera_names=np.full(len(places), camera.name),
         pixels_previous=pixels_previous.take(places, axis=0),
         pixels_current=pixels_current.take(places, axis=0),

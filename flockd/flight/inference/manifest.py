@@ -9,15 +9,12 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from flockd.core.choices import Provider
+from flockd.core.choices import Provider, Role
 from flockd.core.config.base import PlainName, Positive, Section, text
 from flockd.core.errors import ModelError
 from flockd.core.messages import Float32Array, FloatArray
 
-Unknown = Literal["nothing", "scale", "scale_and_shift"]
 Key = tuple[str | int, ...]
-
-_CHANNELS = {"rgb": 3, "bgr": 3, "grey": 1}
 
 
 @dataclass(frozen=True)
@@ -69,7 +66,7 @@ class InputSpec(TensorSpec):
             if self.dtype == "uint8":
                 yield Fault(("dtype",), "uint8 is for images; write float32 or float16 for planes")
             return
-        channels = _CHANNELS[self.colour]
+        channels = 1 if self.colour == "grey" else 3
         axis = 3 if self.layout == "nhwc" else 1
         if self.shape[axis] != channels:
             message = f"{self.shape[axis]} is not the {channels} of a {self.colour} image in {self.layout}"
@@ -82,11 +79,9 @@ class InputSpec(TensorSpec):
 
 
 class DepthMeaning(Section):
-    """Meaning of a depth output."""
+    """Meaning of a depth output, which is metric."""
 
     quantity: Literal["depth", "inverse_depth"] = "depth"
-    unknown: Unknown = "nothing"
-    """What the network leaves undetermined. `perception.scale` must then be `height`, which determines it."""
     focal_px: Positive | None = None
     """Focal length in pixels of the input for which depth is metric; for other cameras it is scaled."""
 
@@ -163,8 +158,8 @@ class Manifest(Section):
     """All facts about one model."""
 
     name: PlainName
-    roles: Annotated[tuple[str, ...], Field(min_length=1)]
-    """Roles that it can fill; the code that uses a role defines its requirements."""
+    roles: Annotated[tuple[Role, ...], Field(min_length=1)]
+    """Roles that it can fill; `requirements` has what each requires."""
     file: Annotated[str, Field(min_length=1)]
     sha256: Annotated[str, text(r"^[0-9a-f]{64}$", "a SHA-256, 64 hexadecimal digits in small letters")]
     description: str
@@ -214,12 +209,6 @@ class Manifest(Section):
         if self.crop is None or self.fixed_size is None:
             raise ModelError(f"model {self.name} takes no crops; choose one whose manifest has a section `crop`")
         return self.fixed_size[0]
-
-    def threshold(self, name: str) -> float:
-        """A decision threshold of the outputs. Raises ModelError if the manifest has none of that name."""
-        if name not in self.thresholds:
-            raise ModelError(f"model {self.name} has no thresholds.{name}; add it to its manifest")
-        return self.thresholds[name]
 
     def faults(self) -> Iterator[Fault]:
         """Contradictions within the manifest, whatever the model is used for."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -16,10 +16,9 @@ from flockd.core.config.perception import DIS, NO_MODEL, PerceptionConfig
 from flockd.core.config.validation_messages import problems_of
 from flockd.core.data import data_path
 from flockd.core.errors import ConfigError, ConfigProblem, ModelError, shortage_of
-from flockd.flight.inference.manifest import Fault, Key, Manifest
+from flockd.flight.inference.manifest import Key, Manifest
+from flockd.flight.inference.requirements import check_roles
 
-Check = Callable[[Manifest], Iterable[Fault]]
-"""Returns a manifest's faults for one use of the model."""
 MAX_MODEL_BYTES = 2 << 30
 """Largest protobuf, and so the largest ONNX file without external weights."""
 
@@ -67,12 +66,7 @@ class ManifestFile:
             )
 
 
-def nothing_more(manifest: Manifest) -> Iterable[Fault]:
-    """A check that accepts every manifest, for a caller that only describes the model."""
-    return ()
-
-
-def read_manifest(path: Path, check: Check = nothing_more) -> ManifestFile:
+def read_manifest(path: Path) -> ManifestFile:
     """The manifest at ``path``; its model file is not opened.
 
     Raises ModelError with the first thing wrong: one sentence with file, line, key, value and what to do.
@@ -88,14 +82,14 @@ def read_manifest(path: Path, check: Check = nothing_more) -> ManifestFile:
     if document.problems:
         raise ModelError(str(min(document.problems)))
     file = ManifestFile(path, manifest, document.places)
-    for fault in chain(manifest.faults(), check(manifest)):
+    for fault in chain(manifest.faults(), check_roles(manifest)):
         raise file.error(fault.key, fault.message)
     return file
 
 
-def load_manifest(path: Path, check: Check = nothing_more) -> tuple[Manifest, Path]:
+def load_manifest(path: Path) -> tuple[Manifest, Path]:
     """The manifest at ``path`` and its model file's path, hash checked. Raises ModelError; see `read_manifest`."""
-    file = read_manifest(path, check)
+    file = read_manifest(path)
     file.check_model()
     return file.manifest, file.model
 
@@ -137,7 +131,7 @@ def models_for(role: Role, folder: Path) -> tuple[str, ...]:
 
 
 _WITHOUT_MODEL: Mapping[str, tuple[str, ...]] = {
-    "flow": (DIS,), "detector": (NO_MODEL,), "distance": (NO_MODEL,), "verification": (NO_MODEL,)
+    "flow": (DIS,), "detector": (NO_MODEL,), "verification": (NO_MODEL,)
 }  # fmt: skip
 
 

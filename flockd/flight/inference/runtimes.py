@@ -11,14 +11,20 @@ from typing import TYPE_CHECKING, Any, Protocol
 import onnxruntime as ort
 from numpy.typing import NDArray
 
-from flockd.flight.inference.checks import Tensor
-
 if TYPE_CHECKING:
     import openvino
 
 Arrays = Mapping[str, NDArray[Any]]
 _Shapes = tuple[tuple[int, ...], ...]
 """Shapes of all inputs, in the model's order."""
+
+
+class Tensor(Protocol):
+    """An input or an output as ONNX Runtime describes it."""
+
+    name: str
+    type: str
+    shape: Sequence[int | str | None]
 
 
 class Runtime(Protocol):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,17 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockd.core.choices import Provider
+from flockd.core.errors import FlockdError, UnavailableError, shortage_of
 from flockd.core.messages import Float32Array, UInt8Array
-from flockd.flight.inference.checks import (
-    Deadline,
-    cannot_run,
-    check_golden,
-    check_tensors,
-    no_deadline,
-)
 from flockd.flight.inference.feeds import golden_feeds, shapes_of
 from flockd.flight.inference.fitting import entering, leaving
-from flockd.flight.inference.manifest_file import Check, ManifestFile, nothing_more, read_manifest
+from flockd.flight.inference.manifest import InputSpec, OutputSpec, listed
+from flockd.flight.inference.manifest_file import ManifestFile, read_manifest
 from flockd.flight.inference.providers import (
     SLOW_TO_BUILD,
     Prepared,
@@ -29,6 +24,23 @@ from flockd.flight.inference.providers import (
     open_runtime,
     provider_of,
 )
+from flockd.flight.inference.runtimes import Tensor
+
+_GOLDEN_TOLERANCE = 0.02
+"""Largest difference of mean and deviation: providers round differently."""
+_ROUNDED_TOLERANCE = 0.05
+"""The same for a network in 8 bits on another provider than the first in its manifest, as layers round differently."""
+
+Deadline = Callable[[Callable[[], None], Callable[[], None]], None]
+"""Runs the first function; if it takes too long, calls the second, which stops it, and raises TimeoutError.
+
+This folder has no clock: the caller that opens a model passes a deadline.
+"""
+
+
+def no_deadline(work: Callable[[], None], stop: Callable[[], None]) -> None:
+    """Runs ``work``, however long it takes."""
+    work()
 
 
 class OnnxModel:
@@ -42,7 +54,6 @@ class OnnxModel:
         provider: Provider = "cpu",
         engines: Path | None = None,
         preparing: bool = False,
-        check: Check = nothing_more,
         deadline: Deadline = no_deadline,
     ) -> None:
         """Opens and checks the model. Raises ModelError with file, line, key and what to do.
@@ -53,10 +64,9 @@ class OnnxModel:
             provider: computes the model, with the exception of crops (`provider_of`); it is never replaced silently.
             engines: the folder of engines.
             preparing: whether a provider that is slow to build engines may do so now.
-            check: further requirements of the manifest.
             deadline: for the run on the golden input.
         """
-        file = read_manifest(path, check)
+        file = read_manifest(path)
         file.check_model()
         self.manifest = file.manifest
         self._refuse_provider(file, provider)
@@ -70,7 +80,7 @@ class OnnxModel:
         if self._engines is not None:
             self._engines.mkdir(parents=True, exist_ok=True)
         self._runtime = open_runtime(file, threads=threads, provider=provider, folder=self._engines)
-        check_tensors(file, self._runtime.inputs, self._runtime.outputs)
+        _check_tensors(file, self._runtime.inputs, self._runtime.outputs)
         self._check_golden(file, provider, deadline)
 
     @property
@@ -128,9 +138,67 @@ class OnnxModel:
             )
 
     def _check_golden(self, file: ManifestFile, provider: Provider, deadline: Deadline) -> None:
+        """Raises ModelError if mean or deviation of an output for the golden input differs from the manifest's."""
         outputs: dict[str, NDArray[Any]] = {}
         try:
             deadline(lambda: outputs.update(self.run(golden_feeds(self.manifest))), self.terminate)
         except Exception as error:  # noqa: BLE001 - the libraries' own exception types are private
             raise cannot_run(file, self.provider, error) from None
-        check_golden(file, provider, outputs)
+        made_for = self.manifest.providers
+        tolerance = _GOLDEN_TOLERANCE if not made_for or made_for[0] == provider else _ROUNDED_TOLERANCE
+        for name, spec in self.manifest.outputs.items():
+            found, expected = (outputs[name].mean(), outputs[name].std()), (spec.golden_mean, spec.golden_deviation)
+            allowed = tolerance * (abs(spec.golden_mean) + spec.golden_deviation) + 1e-6
+            if not all(abs(one - other) <= allowed for one, other in zip(found, expected, strict=True)):
+                said, wanted = ("mean {:.4g} and deviation {:.4g}".format(*pair) for pair in (found, expected))
+                difference = f"the golden input gives {said}, not {wanted}"
+                raise file.error(("outputs", name), f"{difference}; export the model and its manifest together")
+
+
+def _check_tensors(file: ManifestFile, inputs: Sequence[Tensor], outputs: Sequence[Tensor]) -> None:
+    """Raises ModelError if the ONNX file's inputs and outputs differ from the manifest's."""
+    manifest = file.manifest
+    for key, specs, tensors in (("inputs", manifest.inputs, inputs), ("outputs", manifest.outputs, outputs)):
+        found = {tensor.name: tensor for tensor in tensors}
+        unused = key == "inputs" and len(found) > len(specs)  # the model needs every input; outputs may be unused
+        if unused or not specs.keys() <= found.keys():
+            fault = f"the manifest names {sorted(specs)} but the model file has {sorted(found)}"
+            raise file.error((key,), f"{fault}; make them agree")
+        for name, spec in specs.items():
+            for what, here, there in _misfits(spec, found[name]):
+                fault = f"the manifest says {here} but the model file {there}"
+                raise file.error((key, name, what), f"{fault}; make them agree")
+
+
+def _misfits(spec: InputSpec | OutputSpec, tensor: Tensor) -> Iterator[tuple[str, str, str]]:
+    """What differs between a manifest's and a file's tensor. The manifest may fix a size that the file leaves free."""
+    dtype = {"tensor(float)": "float32"}.get(tensor.type, tensor.type.removeprefix("tensor(").removesuffix(")"))
+    if dtype != spec.dtype:
+        yield "dtype", spec.dtype, dtype
+    is_output, shape = isinstance(spec, OutputSpec), tensor.shape
+    fits = len(shape) == len(spec.shape) and all(
+        not isinstance(there, int) or here == there or (is_output and isinstance(here, str))
+        for here, there in zip(spec.shape, shape, strict=True)
+    )
+    if not fits and (shape or not is_output):  # exporters may leave out shapes of outputs
+        yield "shape", listed(spec.shape), listed(list(shape))
+
+
+def cannot_run(file: ManifestFile, provider: str, error: Exception) -> FlockdError:
+    """The error for a model that does not run on the golden input."""
+    if (lacking := shortage_of(error)) is not None:
+        return UnavailableError(f"{file.model} cannot be run: out of {lacking}; raise the limits")
+    if isinstance(error, TimeoutError):
+        return file.error(
+            ("file",),
+            f"{file.manifest.file} did not finish the golden input in time ({error}); restore the model file or "
+            "choose another perception.provider",
+        )
+    if isinstance(error, FloatingPointError):
+        return file.error(("file",), f"{error} on the golden input; restore the model file")
+    reason = str(error).splitlines()[0].rpartition("Status Message: ")[2].rpartition("] ")[2]
+    return file.error(
+        ("file",),
+        f"{provider} cannot run {file.manifest.file} ({reason}); choose another perception.provider or restore the "
+        "model file",
+    )

@@ -5,9 +5,8 @@ All is horizontal except heights. No mission knows another drone's intentions.
 
 from __future__ import annotations
 
-from flockd.core.config.mission import MissionParameters
-from flockd.flight.mission.guidance import Guidance, Moment
+from flockd.flight.mission.guidance import Moment
 from flockd.flight.mission.navigator import Navigator
 from flockd.flight.mission.orders import order_fault
 
-__all__ = ["Guidance", "MissionParameters", "Moment", "Navigator", "order_fault"]
+__all__ = ["Moment", "Navigator", "order_fault"]

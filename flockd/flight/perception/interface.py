@@ -2,19 +2,123 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple, Protocol, TypeVar
 
 import cv2
 
-from flockd.core.messages import Float32Array, Frame, UInt8Array
-from flockd.flight.geometry import RigCamera
-from flockd.flight.perception.detection.second_stage import SecondStage
-from flockd.flight.perception.maps import Crop, RangeEstimate, SceneMaps
+from flockd.core.errors import ModelError
+from flockd.core.messages import Float32Array, FloatArray, Frame, UInt8Array
+from flockd.flight.geometry import RigCamera, ZMap
+from flockd.flight.inference import Manifest
+from flockd.flight.inference.manifest import CropSpec
+from flockd.flight.perception.detection.instances import Instance
 
 T = TypeVar("T")
 CAMERA_FAULTS = (FloatingPointError, ValueError, cv2.error)
 """Errors that one camera's image may cause: output not finite, height below the ground, unusable image."""
+
+
+@dataclass(frozen=True, eq=False)
+class SceneMaps:
+    """A network's maps of one image."""
+
+    depth: ZMap
+    """(h, w) metres along the optical axis, the sky very far."""
+    labels: UInt8Array
+    """(h, w) 0 for background, then one value for each drone."""
+    instances: tuple[Instance, ...]
+
+    @cached_property
+    def labelled(self) -> tuple[slice, slice]:
+        """The smallest part of the image, at least one pixel, that contains all labels: they are few."""
+        left, top, width, height = cv2.boundingRect(self.labels)
+        return slice(top, top + max(height, 1)), slice(left, left + max(width, 1))
+
+
+class Crop(NamedTuple):
+    """An image of one region of interest, taken by a virtual pinhole camera that faces it."""
+
+    image: UInt8Array
+    """(size, size, 3) RGB"""
+    focal_px: float
+    R_body_camera: FloatArray
+    """(3, 3) from optical RDF to body FRD."""
+    centre: FloatArray
+    """(3,) optical centre, metres in the body."""
+    mirrored: bool = False
+    """Whether the network gets the mirror image, on which its errors differ. The estimate is for the crop itself."""
+    evidence: float = 0.0
+    """Log odds of a drone known before; they are added to the crop's."""
+
+
+@dataclass(frozen=True)
+class KnownSize:
+    """Size of every drone of the fleet, from tip to tip, and its standard deviation."""
+
+    size_m: float
+    sigma_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class RangeEstimate:
+    """The second stage's estimate from one crop."""
+
+    log_range: float
+    """Natural logarithm of the range in metres, from the virtual camera's optical centre."""
+    log_range_sigma: float
+    """Standard deviation of `log_range`, given the size."""
+    centre: FloatArray
+    """(2,) u, v of the drone's centre in the crop."""
+    size_m: float
+    """The drone's size from tip to tip; its error is that of the range, but the same in every crop of one drone."""
+    drone_probability: float = 1.0
+    """Probability that there is a drone at all."""
+    log_size_sigma: float = 0.0
+    """Standard deviation of the logarithm of `size_m`. `log_range` has the same error besides its own."""
+
+
+@dataclass(frozen=True)
+class SecondStage:
+    """How the second stage's crops are cut and its outputs judged, as its manifests say."""
+
+    crop_size: int
+    """Width and height of its crops, pixels."""
+    rules: CropSpec
+    drone_probability: float
+    """From this probability on, one picture alone shows a drone."""
+    another_crop_probability: float
+    """A proposal with at most this probability is rejected without another crop."""
+    mean_sigma_factor: float
+    """Error of the mean of a crop and its mirrored one, relative to that of a single crop."""
+    min_relative_sigma: float
+    bearing_sigma_rad: float
+
+    @classmethod
+    def of(cls, distance: Manifest, verification: Manifest | None = None) -> SecondStage:
+        """The second stage from a distance network, and the verification network whose probability replaces its own.
+
+        Raises ModelError if the two take crops of different sizes.
+        """
+        judge, of_range = verification or distance, distance.thresholds
+        if judge.fixed_size != distance.fixed_size:
+            raise ModelError(
+                f"perception.verification: model {judge.name} takes crops of another size than {distance.name}; "
+                "choose one that takes the same"
+            )
+        assert distance.crop is not None  # as the role requires
+        return cls(
+            crop_size=distance.crop_size_px,
+            rules=distance.crop,
+            drone_probability=judge.thresholds["drone_probability"],
+            another_crop_probability=judge.thresholds["another_crop_probability"],
+            mean_sigma_factor=of_range["mean_sigma_factor"],
+            min_relative_sigma=of_range["min_relative_sigma"],
+            bearing_sigma_rad=of_range["bearing_sigma_rad"],
+        )
 
 
 class ImageView(NamedTuple):
@@ -35,27 +139,13 @@ class ImagePair(NamedTuple):
     """(h, w) of the first image: one value a drone, 0 and 255 none."""
 
 
-class _Stages(Protocol):
-    @property
-    def map_stride(self) -> int:
-        """Image pixels per pixel of the first stage's maps."""
-        ...
+class Networks(Protocol):
+    """All networks of a drone: `OnnxNetworks`, those that watch them, or a simulator's exact ones."""
 
-    @property
-    def second_stage(self) -> SecondStage | None:
-        """How the crops for `ranges` are cut; None: there is no second stage."""
-        ...
-
-    def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
-        """Range and centre of the drone in the middle of each crop.
-
-        The range may be NaN if the probability is at most `Thresholds.another_crop`.
-        """
-        ...
-
-
-class Networks(_Stages, Protocol):
-    """Interface of all networks: `OnnxNetworks`, or exact ones that a simulator puts in their place."""
+    map_stride: int
+    """Image pixels per pixel of the first stage's maps."""
+    second_stage: SecondStage
+    """How the crops for `ranges` are cut."""
 
     def flows(self, pairs: Sequence[ImagePair]) -> list[Float32Array | Exception]:
         """For each pair (h, w, 2) pixels from the first image to the second, or one of `CAMERA_FAULTS`."""
@@ -65,27 +155,33 @@ class Networks(_Stages, Protocol):
         """Depth and drones of each image, or one of `CAMERA_FAULTS`."""
         ...
 
+    def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
+        """Range and centre of the drone in the middle of each crop.
 
-class ImageNetworks(_Stages, Protocol):
-    """The same for one image or pair at a time; `OneByOne` makes `Networks` of it."""
+        The range may be NaN if the probability is at most `another_crop_probability`.
+        """
+        ...
 
+
+class OneByOne(Networks):
+    """Networks that take one image or pair at a time; to inherit from."""
+
+    @abstractmethod
     def flow(self, first: Frame, second: Frame, labels: UInt8Array) -> Float32Array:
         """Flow of one `ImagePair`; raises one of `CAMERA_FAULTS`."""
-        ...
 
+    @abstractmethod
     def scene(self, frame: Frame, camera: RigCamera, ground: Float32Array | None) -> SceneMaps:
         """Maps of one `ImageView`; raises one of `CAMERA_FAULTS`."""
-        ...
 
+    def terminate(self) -> None:
+        """Ends every run in progress, from any thread, if that is possible; its caller gets an error."""
 
-class OneByOne:
-    """Processes several images one after the other; to inherit from."""
-
-    def flows(self: ImageNetworks, pairs: Sequence[ImagePair]) -> list[Float32Array | Exception]:
+    def flows(self, pairs: Sequence[ImagePair]) -> list[Float32Array | Exception]:
         """See `Networks`."""
         return [outcome(self.flow, *pair) for pair in pairs]
 
-    def scenes(self: ImageNetworks, views: Sequence[ImageView]) -> list[SceneMaps | Exception]:
+    def scenes(self, views: Sequence[ImageView]) -> list[SceneMaps | Exception]:
         """See `Networks`."""
         return [outcome(self.scene, *view) for view in views]
 
@@ -96,11 +192,3 @@ def outcome(function: Callable[..., T], *arguments: object) -> T | Exception:
         return function(*arguments)
     except CAMERA_FAULTS as error:
         return error
-
-
-class Flow(Protocol):
-    """A method of optical flow: the displacement of each pixel of the first image in the second."""
-
-    def flow(self, first: UInt8Array, second: UInt8Array) -> Float32Array:
-        """(h, w, 3) RGB twice -> (h, w, 2) pixels right and down."""
-        ...

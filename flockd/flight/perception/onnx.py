@@ -15,26 +15,21 @@ from flockd.core.config.perception import NO_MODEL, PerceptionConfig
 from flockd.core.errors import ModelError
 from flockd.core.messages import BoolArray, Float32Array, FloatArray, Frame, UInt8Array
 from flockd.flight.geometry import RigCamera, ZMap
-from flockd.flight.inference.checks import Deadline, no_deadline
 from flockd.flight.inference.fitting import fit
-from flockd.flight.inference.manifest import Unknown
 from flockd.flight.inference.manifest_file import manifest_path, models_folder, models_for
 from flockd.flight.inference.providers import engines_folder
-from flockd.flight.inference.session import OnnxModel
+from flockd.flight.inference.session import Deadline, OnnxModel, no_deadline
 from flockd.flight.perception.detection.boxes import BoxRules, kept_boxes, probable_boxes, with_boxes
 from flockd.flight.perception.detection.instances import group_instances
-from flockd.flight.perception.detection.second_stage import SecondStage
-from flockd.flight.perception.flow import DisFlow, Flow, OnnxFlow, grid_flow
-from flockd.flight.perception.interface import OneByOne
-from flockd.flight.perception.maps import Crop, OpenDepth, RangeEstimate, SceneMaps
-from flockd.flight.perception.requirements import check_roles
+from flockd.flight.perception.flow import DisFlow, OnnxFlow, grid_flow
+from flockd.flight.perception.interface import Crop, OneByOne, RangeEstimate, SceneMaps, SecondStage
 
 CROPS_PER_RUN = 24
 """Crops in one run of a network, so that an image full of false proposals takes no more memory."""
 _WHOLE_PX = 800
 """Longest side of an image in which a detector finds drones of any size."""
-_MIN_DEPTH_M, _MAX_DEPTH_M = 1e-3, 1e3
-"""Limits of depth before a reciprocal is taken: the lens itself, and what flow and height can measure."""
+_MAX_DEPTH_M = 1e3
+"""Largest depth that is taken from an inverse depth: the sky's is about 0, or less."""
 _NO_DRONE_LOGIT = np.float32(-50.0)
 """The logit outside the lens's image."""
 _MIN_RAY_Z = 0.1
@@ -63,16 +58,14 @@ class OnnxNetworks(OneByOne):
         self._flow = self._build_flow(config)
         self._depth = self._models.open(config.depth, "depth")
         self._segmentation = self._models.open(config.segmentation, "segmentation")
-        self._unknown = self._what_is_unknown(config)
-        self._distance = None if config.distance == NO_MODEL else self._models.open(config.distance, "distance")
-        self._detector, self._box_rules = self._open_detector(config)
-        has_verification = self._distance is not None and config.verification != NO_MODEL
+        self._distance = self._models.open(config.distance, "distance")
+        self._detector = None if config.detector == NO_MODEL else self._models.open(config.detector, "detector")
+        self._box_rules = None if self._detector is None else BoxRules.of(self._detector.manifest)
+        has_verification = config.verification != NO_MODEL
         self._verification = self._models.open(config.verification, "verification") if has_verification else None
         self.map_stride = self._segmentation.manifest.map_stride or 1
-        self.second_stage = None
-        if self._distance is not None:
-            verification = None if self._verification is None else self._verification.manifest
-            self.second_stage = SecondStage.of(self._distance.manifest, verification)
+        verification = None if self._verification is None else self._verification.manifest
+        self.second_stage = SecondStage.of(self._distance.manifest, verification)
 
     def terminate(self) -> None:
         """Ends every run in progress; its caller gets an error."""
@@ -97,10 +90,7 @@ class OnnxNetworks(OneByOne):
         logit = self._at_map_stride(maps["drone"], (width, height))[0]
         logit = np.where(_blind(camera, self.map_stride), _NO_DRONE_LOGIT, logit)
         offset = self._at_map_stride(maps["offset"], (width, height))
-        # A second stage rejects false proposals, so the first may propose more.
-        threshold = self._segmentation.manifest.threshold
-        alone = threshold("proposal_logit_alone")
-        proposal = alone if self._distance is None else threshold("proposal_logit")
+        proposal = self._segmentation.manifest.thresholds["proposal_logit"]
         labels, instances = group_instances(logit - np.float32(proposal), offset, scale=self.map_stride)
         labels = np.asarray(cv2.resize(labels, (width, height), interpolation=cv2.INTER_NEAREST), dtype=np.uint8)
         if self._detector is not None and self._box_rules is not None:
@@ -110,37 +100,26 @@ class OnnxNetworks(OneByOne):
 
     def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
         """See `Networks`."""
-        if self._distance is None or self.second_stage is None:
-            raise ValueError("this configuration has no distance model")
         if not crops:
             return ()
         images = [np.ascontiguousarray(c.image[:, ::-1]) if c.mirrored else c.image for c in crops]
-        size, evidence = self.second_stage.crop_size, np.array([crop.evidence for crop in crops])
-        if self._verification is None:
-            return self._ranges(self._distance, crops, images, evidence, limit=math.inf)
-        outputs = _in_batches(self._verification, images)
-        logits = self._verification.manifest.results["drone"].by_column(outputs["drone"])["drone_logit"] + evidence
-        judge = self._verification if self._detector is None else self._detector
-        limit = judge.manifest.threshold("distance_logit_limit")
+        logits, limit = np.array([crop.evidence for crop in crops]), math.inf
+        if self._verification is not None:
+            outputs = _in_batches(self._verification, images)["drone"]
+            logits = logits + self._verification.manifest.results["drone"].by_column(outputs)["drone_logit"]
+            judge = self._verification if self._detector is None else self._detector
+            limit = judge.manifest.thresholds["distance_logit_limit"]
         # Without a drone no range is needed: most crops of a cluttered image end here.
         most = _probability(logits + limit)
-        rest = [k for k, p in enumerate(most) if p > self.second_stage.thresholds.another_crop]
-        ranged = self._ranges(
-            self._distance, [crops[k] for k in rest], [images[k] for k in rest], logits[rest], limit=limit
-        )
-        estimates = [_no_range(float(p), size) for p in most]
+        rest = [k for k, p in enumerate(most) if p > self.second_stage.another_crop_probability]
+        ranged = self._ranges([crops[k] for k in rest], [images[k] for k in rest], logits[rest], limit)
+        estimates = [_no_range(float(p), self.second_stage.crop_size) for p in most]
         for k, estimate in zip(rest, ranged, strict=True):
             estimates[k] = estimate
         return tuple(estimates)
 
-    @staticmethod
     def _ranges(
-        distance: OnnxModel,
-        crops: Sequence[Crop],
-        images: Sequence[UInt8Array],
-        logits: FloatArray,
-        *,
-        limit: float,
+        self, crops: Sequence[Crop], images: Sequence[UInt8Array], logits: FloatArray, limit: float
     ) -> tuple[RangeEstimate, ...]:
         """The distance network's estimates from crops, given their images as its input.
 
@@ -148,8 +127,8 @@ class OnnxNetworks(OneByOne):
         """
         if not crops:
             return ()
-        outputs = _in_batches(distance, images)
-        columns = distance.manifest.results["range"].by_column(outputs["range"])
+        outputs = _in_batches(self._distance, images)["range"]
+        columns = self._distance.manifest.results["range"].by_column(outputs)
         values = {name: np.asarray(column, np.float64) for name, column in columns.items()}
         evidence = logits + np.clip(values["drone_logit"], -limit, limit)
         mirrored, focal_px = np.array([(crop.mirrored, crop.focal_px) for crop in crops]).T
@@ -165,12 +144,6 @@ class OnnxNetworks(OneByOne):
             strict=True,
         )
         return tuple(RangeEstimate(*row) for row in rows)
-
-    def _open_detector(self, config: PerceptionConfig) -> tuple[OnnxModel | None, BoxRules | None]:
-        if self._distance is None or config.detector == NO_MODEL:
-            return None, None
-        detector = self._models.open(config.detector, "detector")
-        return detector, BoxRules.of(detector.manifest)
 
     def _boxes(
         self, detector: OnnxModel, rules: BoxRules, image: UInt8Array, camera: RigCamera
@@ -213,35 +186,18 @@ class OnnxNetworks(OneByOne):
             resized *= np.array([width / maps.shape[2], height / maps.shape[1]], np.float32)[:, None, None]
         return np.asarray(resized, dtype=np.float32)
 
-    def _depth_of(self, depth: Float32Array, camera: RigCamera) -> ZMap | OpenDepth:
-        """Metric depth if the network gives it, else depth with its unknowns; from its output, resized."""
+    def _depth_of(self, depth: Float32Array, camera: RigCamera) -> ZMap:
+        """Metric depth from the network's output, resized."""
         meaning = self._depth.manifest.results["depth"].depth
         is_inverse = meaning.quantity == "inverse_depth"
         if meaning.focal_px:
             size = (depth.shape[1], depth.shape[0])
             longer = fit(self._depth.manifest, size).scale[0] * camera.camera.focal_px / meaning.focal_px
             depth = depth / longer if is_inverse else depth * longer
-        if self._unknown == "nothing":
-            metres = 1.0 / np.maximum(depth, 1.0 / _MAX_DEPTH_M) if is_inverse else depth
-            return ZMap(np.asarray(metres, np.float32))
-        inverse = depth if is_inverse else 1.0 / np.maximum(depth, _MIN_DEPTH_M)
-        return OpenDepth(np.asarray(inverse, np.float32), shift=self._unknown == "scale_and_shift")
+        metres = 1.0 / np.maximum(depth, 1.0 / _MAX_DEPTH_M) if is_inverse else depth
+        return ZMap(np.asarray(metres, np.float32))
 
-    def _what_is_unknown(self, config: PerceptionConfig) -> Unknown:
-        """What the height above ground has to fix of the depth. Raises ModelError."""
-        manifest = self._depth.manifest
-        unknown = manifest.results["depth"].depth.unknown
-        if config.scale == "network" and unknown != "nothing":
-            raise ModelError(
-                f"perception.scale: depth model {config.depth!r} has no metric scale for `network` to take; "
-                "write height, or choose a metric model"
-            )
-        takes_ground = "geometry" in manifest.contents
-        if unknown == "nothing" and config.scale == "height" and not takes_ground:
-            return "scale"
-        return unknown
-
-    def _build_flow(self, config: PerceptionConfig) -> Flow:
+    def _build_flow(self, config: PerceptionConfig) -> DisFlow | OnnxFlow:
         if config.flow == "dis":
             return DisFlow()
         network = OnnxFlow(self._models.open(config.flow, "flow"))
@@ -271,7 +227,6 @@ class _Models:
                 threads=self._config.threads if role in _OF_CROPS else self._share,
                 provider=self._config.provider,
                 engines=engines_folder(self._config),
-                check=check_roles,
                 deadline=self._deadline,
             )
         model = self._opened[path]

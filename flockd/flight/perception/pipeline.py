@@ -7,13 +7,10 @@ from dataclasses import replace
 
 from flockd.core.config.perception import PerceptionConfig
 from flockd.core.messages import Float32Array, Frame, FrameSet, GroundEstimate, Reason, ReasonKind, VehicleState
-from flockd.flight.geometry import RangeMap, Rig, ground_inverse_depth
-from flockd.flight.perception.detection.detector import DetectionTrace, Detector
-from flockd.flight.perception.detection.masks import without_borders
+from flockd.flight.geometry import RangeMap, Rig, ground_inverse_depth, range_map
+from flockd.flight.perception.detection.detector import DetectionTrace, Detector, without_borders
 from flockd.flight.perception.image_monitor import ImageMonitor
-from flockd.flight.perception.interface import CAMERA_FAULTS, ImagePair, ImageView, Networks
-from flockd.flight.perception.maps import KnownSize, SceneMaps
-from flockd.flight.perception.metric_depth import metric_depth
+from flockd.flight.perception.interface import ImagePair, ImageView, KnownSize, Networks, SceneMaps
 from flockd.flight.perception.observation import CameraObservation, Observation
 from flockd.flight.tracking import Prediction
 
@@ -61,7 +58,7 @@ class Perception:
         lap("flow")
         images = {name: usable[name].image for name in scenes}
         size = self._said_size or learned_size
-        found = self._detector.detect(images, scenes, depths, vehicle, predictions, trace or DetectionTrace(), size)
+        found = self._detector.detect(images, scenes, vehicle, predictions, trace or DetectionTrace(), size)
         cameras = {}
         for name, mask in found.masks.items():
             labels = without_borders(mask, self._config.detection.mask_border_px)
@@ -101,14 +98,12 @@ class Perception:
             except ValueError as error:  # a height below the ground
                 reasons.append(_of_camera(name, str(error)))
         for (name, view), scene in zip(views.items(), self._networks.scenes(list(views.values())), strict=True):
-            try:
-                if isinstance(scene, Exception):
-                    raise scene
-                if view.ground is not None or not self._needs_ground:
-                    depths[name] = metric_depth(scene, view.ground, view.camera.camera)
-                scenes[name] = scene
-            except CAMERA_FAULTS as error:
-                reasons.append(_of_camera(name, str(error)))
+            if isinstance(scene, Exception):
+                reasons.append(_of_camera(name, str(scene)))
+                continue
+            scenes[name] = scene
+            if view.ground is not None or not self._needs_ground:
+                depths[name] = range_map(scene.depth, view.camera.camera)
         return scenes, depths, reasons
 
     def _plane(self, camera: str, vehicle: VehicleState, ground: GroundEstimate | None) -> Float32Array | None:

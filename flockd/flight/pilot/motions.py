@@ -20,11 +20,9 @@ def background_pairs(rig: Rig, observation: Observation, parameters: GeometryPar
         camera, before, after = rig.cameras[name], observation.previous.cameras[name], observation.cameras[name]
         if before.depth is None or after.depth is None:
             continue
-        lifted = lift_matches(
-            camera, grid_pixels(camera.camera.size, _stride_px(camera, parameters)), flow,
-            before.depth, after.depth, before.labels, after.labels, max_depth_m=parameters.max_depth_m,
-        )  # fmt: skip
-        pairs.append(lifted.select(lifted.labels == 0))
+        pixels = grid_pixels(camera.camera.size, _stride_px(camera, parameters))
+        maps = flow, before.depth, after.depth, before.labels, after.labels
+        pairs.append(lift_matches(camera, pixels, *maps, max_depth_m=parameters.max_depth_m))
     if not pairs:
         raise ValueError("no depth has a scale" if observation.flows else "no camera has both frames")
     return PointPairs.concatenate(pairs)

@@ -40,7 +40,7 @@ from flockd.flight.mission.navigator import Lookout, middle_of
 from flockd.flight.obstacles import Avoidance, LocalMap, ObstacleRanging, nothing_found
 from flockd.flight.perception import Networks, Observation, Perception, load_networks
 from flockd.flight.perception.detection.detector import DetectionTrace
-from flockd.flight.perception.maps import KnownSize
+from flockd.flight.perception.interface import KnownSize
 from flockd.flight.pilot.camera_agreement import CameraAgreement, moves_otherwise
 from flockd.flight.pilot.ground import GroundFilter, scaled_by_ground
 from flockd.flight.pilot.motions import background_pairs

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from flockd.core.config.safety import GateParameters, SafetyParameters
 from flockd.flight.safety.events import OFFBOARD, CameraHealth, Event, Inputs, MissionEnd, link_lost
 from flockd.flight.safety.fence import outside_fence, outside_heights
 from flockd.flight.safety.gate import Gate
@@ -17,13 +16,11 @@ __all__ = [
     "Decision",
     "Event",
     "Gate",
-    "GateParameters",
     "Inputs",
     "MissionEnd",
     "Objection",
     "Permission",
     "Request",
-    "SafetyParameters",
     "State",
     "Supervisor",
     "Surroundings",

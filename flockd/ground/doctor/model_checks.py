@@ -16,7 +16,6 @@ from flockd.core.messages import Frame, FrameSet, PilotOutput, UInt8Array, Vehic
 from flockd.flight.inference import OnnxModel, manifests_of
 from flockd.flight.inference.providers import engines_folder
 from flockd.flight.perception import Networks
-from flockd.flight.perception.requirements import check_roles
 from flockd.flight.pilot import FlockPilot
 from flockd.ground.doctor import Finding, Level, failed_from_error, graded, passed
 from flockd.onboard.daemon import load_side_by_side
@@ -52,7 +51,6 @@ def _each(config: DroneConfig) -> Iterator[Finding]:
                 threads=wanted.threads,
                 provider=wanted.provider,
                 engines=engines_folder(wanted),
-                check=check_roles,
                 deadline=within(GOLDEN_S),
             )
         except ModelError as error:

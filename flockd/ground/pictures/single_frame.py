@@ -15,8 +15,8 @@ from flockd.core.messages import Detection, FloatArray, Frame, FrameSet, UInt8Ar
 from flockd.flight.geometry import Camera, PinholeCamera, Rig, RigCamera, RigidTransform, WideAngleCamera
 from flockd.flight.perception import Networks, Perception, load_networks
 from flockd.flight.perception.detection.detector import DetectionTrace
+from flockd.flight.perception.detection.proposals import angles_between
 from flockd.flight.perception.detection.refinement import Candidate
-from flockd.flight.perception.detection.roi import angles_between
 
 MAX_SIDE_PX = 1280
 """Larger pictures are resized to this before the networks: they were trained on cameras of 640 pixels."""
@@ -130,8 +130,7 @@ class PictureDetector:
             config = config.model_copy(update={"detection": more})
         if "camera" not in observation.cameras:  # the networks' output was not finite
             return PictureResult((), 0, np.zeros(image.shape[:2], np.uint8))
-        seen, stage = observation.cameras["camera"].labels, self._networks.second_stage
-        least = 0.0 if stage is None else stage.thresholds.drone
+        seen, least = observation.cameras["camera"].labels, self._networks.second_stage.drone_probability
         sure = [one for one in observation.detections if one.drone_probability >= least]
         mask = np.where(np.isin(seen, [one.label for one in sure]), seen, np.uint8(0))
         found = tuple(self._drone(one, camera, mask, trace.candidates, scale) for one in sure)

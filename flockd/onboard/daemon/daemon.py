@@ -14,6 +14,7 @@ from flockd.core.config import DroneConfig
 from flockd.core.errors import ConfigError, FlockdError
 from flockd.core.secrets import masked
 from flockd.flight.geometry import build_rig
+from flockd.flight.perception import OneByOne
 from flockd.flight.safety import Decision, Event, Gate, State
 from flockd.onboard.autopilot.autopilot_status import AutopilotError
 from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
@@ -31,7 +32,7 @@ from flockd.onboard.daemon.operator_orders import MissionOrders, OperatorCommand
 from flockd.onboard.daemon.pilot_loop import PilotLoop, VehicleHistory
 from flockd.onboard.daemon.status import Components, ServiceManager, notify_service_manager, publish_status
 from flockd.onboard.daemon.supervisor_inputs import InputCollector, LoopLag, Thermometer
-from flockd.onboard.daemon.watched_networks import InterruptibleNetworks, WatchedNetworks, cameras_at_once
+from flockd.onboard.daemon.watched_networks import WatchedNetworks, cameras_at_once
 from flockd.onboard.sources import open_source
 from flockd.onboard.telemetry.preview import Previews
 from flockd.onboard.telemetry.publisher import ZenohTelemetry
@@ -59,7 +60,7 @@ class Daemon:
         config: DroneConfig,
         file: str,
         *,
-        load_networks: Callable[[], InterruptibleNetworks],
+        load_networks: Callable[[], OneByOne],
         models: Mapping[str, str],
         recordings: Path | None,
         service: ServiceManager,

@@ -7,15 +7,15 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
-from typing import Any, Protocol, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 from flockd.core.config import DroneConfig
 from flockd.core.messages import Float32Array
 from flockd.flight.perception import (
     Crop,
-    ImageNetworks,
     ImagePair,
     ImageView,
+    OneByOne,
     RangeEstimate,
     SceneMaps,
     load_networks,
@@ -28,13 +28,6 @@ TERMINATE_S = 0.5
 """Longest time for a run to end when told to; ONNX Runtime takes a few milliseconds."""
 MAX_ABANDONED = 2
 """Calls of one kind in a row with abandoned workers; after them only a restart of the process helps."""
-
-
-class InterruptibleNetworks(ImageNetworks, Protocol):
-    """Networks whose runs can be ended."""
-
-    def terminate(self) -> None:
-        """Ends every running call, from any thread."""
 
 
 def cameras_at_once(config: DroneConfig) -> int:
@@ -59,7 +52,7 @@ class WatchedNetworks:
     from the start of its worker.
     """
 
-    def __init__(self, networks: InterruptibleNetworks, deadline_s: float, at_once: int = 1) -> None:
+    def __init__(self, networks: OneByOne, deadline_s: float, at_once: int = 1) -> None:
         self.second_stage = networks.second_stage
         self.map_stride = networks.map_stride
         self._networks = networks

@@ -29,7 +29,7 @@ from flockd.flight.geometry import (
     build_rig,
     rotation_angle_deg,
 )
-from flockd.flight.perception import Crop, ImageNetworks, OneByOne, RangeEstimate, SceneMaps, load_networks
+from flockd.flight.perception import Crop, OneByOne, RangeEstimate, SceneMaps, load_networks
 from flockd.flight.pilot import FlockPilot
 from flockd.ground.datasets.image_folder import Dataset, DatasetFrame
 from flockd.review.flight_log.log import spread
@@ -120,7 +120,7 @@ class Pair:
 class RecordedDepth(OneByOne):
     """The learned perception, with the recorded depth in place of the network's."""
 
-    def __init__(self, learned: ImageNetworks) -> None:
+    def __init__(self, learned: OneByOne) -> None:
         self.second_stage = learned.second_stage
         self.map_stride = learned.map_stride
         self._learned = learned

@@ -307,7 +307,7 @@ def test_a_relative_path_counts_from_the_folder_of_the_file_it_stands_in(
     drones.mkdir()
     elsewhere.mkdir()
     folders = "models_dir: ../models, engines_dir: e"
-    perception = f"perception: {{{folders}, flow: mine/flow.yaml, depth: /opt/depth.yaml, distance: none}}\n"
+    perception = f"perception: {{{folders}, flow: mine/flow.yaml, depth: /opt/depth.yaml, detector: none}}\n"
     (drones / "drone.yaml").write_text(f"{DRONE}{perception}telemetry: {{zenoh_config: tls.json5}}\n", encoding="utf-8")
     monkeypatch.chdir(elsewhere)
     drone = load_drone("../drones/drone.yaml")
@@ -315,7 +315,7 @@ def test_a_relative_path_counts_from_the_folder_of_the_file_it_stands_in(
     assert drone.perception.engines_dir == str(drones / "e")
     assert drone.perception.flow == str(drones / "mine" / "flow.yaml")
     assert drone.telemetry.zenoh_config == str(drones / "tls.json5")
-    assert (drone.perception.depth, drone.perception.distance) == ("/opt/depth.yaml", "none")
+    assert (drone.perception.depth, drone.perception.detector) == ("/opt/depth.yaml", "none")
     assert drone.perception.segmentation == "neighbours_int8", "a name is not a path"
     overridden = load_drone("../drones/drone.yaml", {"perception.models_dir": "here"})
     assert overridden.perception.models_dir == "here", "who overrides it stands elsewhere"

@@ -124,7 +124,6 @@ def _lifted(
     return PointPairs(
         previous=camera.T_body_camera.apply(camera.camera.unproject(pixels[kept], depth[kept])),
         current=camera.T_body_camera.apply(camera.camera.unproject(pixels_after[kept], depth_after[kept])),
-        labels=np.zeros(int(kept.sum()), dtype=np.int64),
         camera_names=np.full(int(kept.sum()), camera.name),
         pixels_previous=pixels[kept],
         pixels_current=pixels_after[kept],

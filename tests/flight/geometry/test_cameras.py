@@ -20,7 +20,6 @@ from flockd.flight.geometry import (
     ZMap,
     build_rig,
     range_map,
-    z_map,
 )
 from tests.make import camera as camera_config
 
@@ -62,7 +61,7 @@ def test_it_projects_as_opencv_does_and_lifts_a_pixel_to_a_range_along_its_ray(c
 
 
 @ALL
-def test_a_map_of_z_lifts_a_pixel_to_where_it_is_and_there_and_back_is_the_same_map(camera: Camera) -> None:
+def test_a_map_of_z_lifts_a_pixel_to_where_it_is(camera: Camera) -> None:
     """A wall across the optical axis: its z is the same everywhere."""
     wall = ZMap(np.full(SIZE[::-1], 5.0, np.float32))
     ranges = range_map(wall, camera)
@@ -72,8 +71,6 @@ def test_a_map_of_z_lifts_a_pixel_to_where_it_is_and_there_and_back_is_the_same_
         column, row = pixel[0].astype(int)
         lifted = camera.unproject(pixel, np.array([ranges[row, column]], np.float64))
         np.testing.assert_allclose(lifted, point, atol=0.02)  # half a pixel off
-    back = z_map(ranges, camera)  # NaN where a lens images nothing
-    np.testing.assert_allclose(back[np.isfinite(back)], 5.0, rtol=1e-6)
 
 
 def test_wide_angle_sees_behind_its_own_plane() -> None:

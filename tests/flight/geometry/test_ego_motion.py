@@ -15,10 +15,10 @@ from flockd.flight.geometry import (
     ego_motion,
     ego_motion_refinement,
     estimate_ego_motion,
-    refine_ego_motion,
     rotation_angle_deg,
     rotation_from_euler,
 )
+from flockd.flight.geometry.ego_motion_refinement import refine_ego_motion
 
 from .synthetic_world import EXACT, Flaws, boxes_around, four_camera_rig, seen_twice
 
@@ -77,24 +77,12 @@ def test_the_polish_is_several_times_closer_than_algorithm_1(flaws: Flaws, limit
     assert np.all(np.median(polished, axis=0) < np.median(raw, axis=0) / 1.5)
 
 
-def test_drones_in_view_do_not_enter_the_own_motion() -> None:
-    pairs, truth = flight(1, EXACT)
-    on_drone = np.arange(len(pairs)) % 2 == 1
-    drifting = pairs.current + np.where(on_drone[:, None], [0.0, 0.3, 0.0], 0.0)
-    motion = estimate_ego_motion(
-        replace(pairs, current=drifting, labels=np.where(on_drone, 3, 0)), RIG, 0.5, POLISHED
-    )  # fmt: skip
-    assert motion.pairs == np.count_nonzero(~on_drone)
-    assert motion.inliers > 0.9 * motion.pairs
-    assert errors(motion, truth)[1] < 1e-4
-
-
 @pytest.mark.parametrize("rises", [True, False])
 def test_a_polish_that_costs_more_than_its_start_is_refused(monkeypatch: pytest.MonkeyPatch, rises: bool) -> None:
     pairs, truth = flight(2, Flaws())
     costs = iter([2.0, 1.0] if rises else [1.0, 2.0])  # of the polished motion, then of the start
     monkeypatch.setattr(ego_motion_refinement._Weighting, "loss", lambda *_: next(costs))
-    assert (refine_ego_motion(pairs, RIG, truth) is None) == rises
+    assert (refine_ego_motion(pairs, RIG, truth, np.ones(len(pairs), np.bool_)) is None) == rises
 
 
 @pytest.mark.parametrize("polished", ["refused", "leaves the matches behind"])

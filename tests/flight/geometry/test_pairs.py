@@ -72,16 +72,13 @@ def test_both_ends_lie_on_the_wall_and_are_one_step_apart() -> None:
     assert np.allclose(CAMERA.pixels_of_points(pairs.previous), pairs.pixels_previous, atol=1e-6)
 
 
-def test_a_match_keeps_its_class_only_where_both_ends_agree() -> None:
+def test_a_match_with_an_end_on_a_drone_is_dropped() -> None:
     labels, labels_after = no_labels(), no_labels()
-    labels[:, 48:] = 2
-    labels_after[:, 60:] = 2
-    pairs = lift(grid_pixels(SIZE, 3), wall_maps(), (labels, labels_after))
-    left, right = pairs.pixels_previous[:, 0] < 48, pairs.pixels_current[:, 0] >= 60
-    assert (left | right).all()
-    assert set(pairs.labels[left].tolist()) == {0}
-    assert set(pairs.labels[right].tolist()) == {2}
-    assert pairs.labels.dtype == np.int64
+    labels[:, 48:], labels_after[:, 60:] = 2, 2
+    everywhere, pairs = (lift(grid_pixels(SIZE, 3), wall_maps(), on) for on in (None, (labels, labels_after)))
+    background = (everywhere.pixels_previous[:, 0] < 48) & (everywhere.pixels_current[:, 0] < 60)
+    assert 0 < np.count_nonzero(background) < len(everywhere)
+    assert np.array_equal(pairs.pixels_current, everywhere.pixels_current[background])
 
 
 @pytest.mark.parametrize("which", ["before", "after"])

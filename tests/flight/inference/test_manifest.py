@@ -14,8 +14,8 @@ from onnx import helper
 
 from flockd.core.data import data_path
 from flockd.core.errors import ModelError
-from flockd.flight.inference import OnnxModel, read_manifest
-from flockd.flight.perception.requirements import check_roles
+from flockd.flight.inference import Manifest, OnnxModel
+from flockd.flight.inference.manifest_file import read_manifest
 from tests.flight.inference.foreign import (
     SIZE,
     image_input,
@@ -61,7 +61,7 @@ def crop_regressor(folder: Path, **keys: Any) -> Path:
         helper.make_node("Abs", ["difference"], ["numbers"]),
     ]
     return write_model(
-        folder, "regressor", "anything", nodes,
+        folder, "regressor", "verification", nodes,
         inputs={"patch": image_input(shape=["n", 3, 24, 24])},
         outputs={"numbers": map_output(["n", 2], columns=["brightness", "darkness"])},
         weights=weights,
@@ -99,7 +99,7 @@ def shipped(name: str) -> Callable[[Path], Path]:
         (depth, {"inputs.rgb.shape": [1, 3, 32, 64]}, "inputs.rgb.shape"),
         (depth, {"inputs.rgb.shape": ["n", 3, 32, 48]}, "inputs.rgb.shape"),
         (depth, {"inputs.rgb.dtype": "float16"}, "inputs.rgb.dtype"),
-        (depth, {"inputs.more": image_input()}, "inputs"),
+        (depth, {"inputs.more": image_input()}, "inputs.more"),
         (depth, {"outputs.moved": map_output([1, 2]) | {"golden_mean": 0.0, "golden_deviation": 0.0}}, "outputs"),
         (crop_regressor, {"map_stride": 0}, "map_stride"),
         (crop_regressor, {"crop.fill": -1.0}, "crop.fill"),
@@ -141,7 +141,7 @@ def test_what_cannot_be_is_refused_in_one_sentence_with_file_line_and_key(
         if model is depth:
             OnnxModel(path, threads=1)
         else:
-            read_manifest(path, check_roles if model not in (crop_regressor, with_planes) else lambda _: ())
+            read_manifest(path)
     found = re.fullmatch(rf"{re.escape(str(path))}:(\d+): {re.escape(key)}: .*; .*", str(refused.value))
     assert found, refused.value
     line = path.read_text().splitlines()[int(found[1]) - 1].strip()
@@ -151,11 +151,10 @@ def test_what_cannot_be_is_refused_in_one_sentence_with_file_line_and_key(
 
 def test_an_output_is_read_by_the_names_of_its_columns(tmp_path: Path) -> None:
     for columns in (["brightness", "darkness"], ["darkness", "brightness"]):
-        model = OnnxModel(changed(crop_regressor(tmp_path), {"outputs.numbers.columns": columns}), threads=1)
-        crops = [np.full((24, 24, 3), grey, np.uint8) for grey in (51, 204)]
-        values = model.infer({"patch": crops})["numbers"]
-        named = model.manifest.outputs["numbers"].by_column(values)
+        written = changed(crop_regressor(tmp_path), {"outputs.numbers.columns": columns}).read_text()
+        numbers = Manifest.model_validate(yaml.safe_load(written), strict=False).outputs["numbers"]
+        named = numbers.by_column(np.array([[0.2, 0.8], [0.8, 0.2]], np.float32))
         np.testing.assert_allclose(named[columns[0]], [0.2, 0.8], rtol=1e-5)
         np.testing.assert_allclose(named[columns[1]], [0.8, 0.2], rtol=1e-5)
     with pytest.raises(ValueError, match="columns darkness, brightness"):
-        model.manifest.outputs["numbers"].by_column(np.zeros((2, 3), np.float32))
+        numbers.by_column(np.zeros((2, 3), np.float32))

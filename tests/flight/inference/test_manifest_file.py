@@ -12,8 +12,8 @@ from random import Random
 import pytest
 
 from flockd.core.errors import ModelError
-from flockd.flight.inference import load_manifest, read_manifest
-from flockd.flight.perception.requirements import check_roles
+from flockd.flight.inference import load_manifest
+from flockd.flight.inference.manifest_file import read_manifest
 from tests.flight.inference.foreign import one_channel_depth
 from tests.hostile import ROOT, hostile, own_errors, put, text_of
 
@@ -67,6 +67,6 @@ def test_a_hostile_manifest_is_read_or_refused(tmp_path: Path) -> None:
     def check(random: Random) -> None:
         put(random, file, lambda: text_of(random, texts))
         with own_errors():
-            read_manifest(file, check_roles).check_model()
+            read_manifest(file).check_model()
 
     check()

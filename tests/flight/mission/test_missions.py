@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 
 from flockd.core.config import DroneConfig, load_drone
-from flockd.core.config.mission import fault_of_place
+from flockd.core.config.mission import MissionParameters, fault_of_place
 from flockd.core.config.safety import GateParameters
 from flockd.core.errors import ConfigError
 from flockd.core.messages import FloatArray, MissionOrder, Setpoint
 from flockd.flight.geometry import euler_from_rotation
-from flockd.flight.mission import Guidance, MissionParameters, Moment, Navigator, order_fault
+from flockd.flight.mission import Moment, Navigator, order_fault
+from flockd.flight.mission.guidance import Guidance
 from flockd.flight.mission.navigator import MAX_TURN_RAD_S, Lookout
 from flockd.flight.safety import Gate, outside_fence
 from flockd.onboard.telemetry.order_messages import order_message, parse_order

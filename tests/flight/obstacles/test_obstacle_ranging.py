@@ -22,7 +22,8 @@ from flockd.flight.geometry import (
     rotation_from_euler,
 )
 from flockd.flight.obstacles import ObstacleRanging
-from flockd.flight.perception import CameraObservation, Observation
+from flockd.flight.perception import Observation
+from flockd.flight.perception.observation import CameraObservation
 from tests.flight.geometry.synthetic_world import four_camera_rig
 from tests.make import scenario, vehicle
 

@@ -9,7 +9,7 @@ from flockd.core.data import data_path
 from flockd.core.messages import FloatArray, UInt8Array
 from flockd.flight.inference import load_manifest
 from flockd.flight.perception import Crop
-from flockd.flight.perception.detection.second_stage import SecondStage
+from flockd.flight.perception.interface import SecondStage
 from flockd.sim.renderer.drone_models import drone_model
 from flockd.sim.renderer.renderer import Renderer, View
 from flockd.sim.world.world import World

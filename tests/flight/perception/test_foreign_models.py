@@ -1,4 +1,4 @@
-"""Models of other people: their manifest says what they take and mean; height says how far, where they do not."""
+"""Models of other people: their manifest says what they take and mean."""
 
 from __future__ import annotations
 
@@ -9,24 +9,19 @@ import numpy as np
 import pytest
 
 from flockd.core.config.perception import PerceptionConfig
-from flockd.core.config.rig import RigConfig
 from flockd.core.data import data_path
 from flockd.core.errors import ModelError
-from flockd.core.messages import BoolArray, Float32Array, FloatArray, Frame, UInt8Array
-from flockd.flight.geometry import Rig, build_rig, ground_inverse_depth, z_map
+from flockd.core.messages import Frame, UInt8Array
 from flockd.flight.inference import OnnxModel
 from flockd.flight.inference.fitting import fit
-from flockd.flight.perception import OnnxFlow, OnnxNetworks, OpenDepth, Perception, SceneMaps
-from flockd.flight.perception.metric_depth import metric_depth
-from flockd.flight.pilot.ground import level_ground
+from flockd.flight.perception import OnnxNetworks
+from flockd.flight.perception.flow import OnnxFlow
 from tests.flight.inference.foreign import SIZE, constant_flow, one_channel_depth
-from tests.make import camera, frames, rig_camera, vehicle
-
-RELATIVE = {"depth": {"quantity": "inverse_depth", "unknown": "scale_and_shift"}}
+from tests.make import rig_camera
 
 
 def perception_with(depth: Path, **config: Any) -> OnnxNetworks:
-    return OnnxNetworks(PerceptionConfig(flow="dis", depth=str(depth), distance="none", **config), data_path("models"))
+    return OnnxNetworks(PerceptionConfig(flow="dis", depth=str(depth), **config), data_path("models"))
 
 
 def plain(colour: tuple[int, int, int], size: tuple[int, int] = SIZE) -> UInt8Array:
@@ -85,70 +80,8 @@ def test_depth_becomes_metres_of_the_camera(
     np.testing.assert_allclose(depth_of(path, plain((red, 0, 0), size), focal_px), expected, rtol=1e-3)
 
 
-def test_a_relative_network_is_refused_where_nothing_fixes_its_scale(tmp_path: Path) -> None:
-    with pytest.raises(ModelError, match=r"perception\.scale: "):
-        perception_with(one_channel_depth(tmp_path, output=RELATIVE), scale="network")
-
-
-# Depth without metres: the height above ground says how far away things are.
-
-WIDTH, HEIGHT = 160, 120
-FACTOR, SHIFT = 2.5, 0.03
-
-
-def rig_of(size: tuple[int, int] = (WIDTH, HEIGHT)) -> Rig:
-    return build_rig(RigConfig(cameras=(camera("front", size, size[0] / 2),)))
-
-
-FRONT = rig_of().cameras["front"]
-U, V = np.meshgrid(np.arange(WIDTH) + 0.5 - WIDTH / 2, np.arange(HEIGHT) + 0.5 - HEIGHT / 2)
-AXIAL_SHARE = 1.0 / np.sqrt(1.0 + (U**2 + V**2) / (WIDTH / 2) ** 2)
-"""z over range in each pixel, by Pythagoras."""
-
-
-def opened(depth: FloatArray, *, shift: bool, labels: UInt8Array | None = None) -> SceneMaps:
-    """What a network says that knows this depth up to the factor and shift above."""
-    inverse = (1.0 / depth - (SHIFT if shift else 0.0)) / FACTOR
-    nothing = np.zeros(depth.shape, np.uint8)
-    return SceneMaps(OpenDepth(inverse.astype(np.float32), shift=shift), nothing if labels is None else labels, ())
-
-
-def depth_of_ground(height_m: float) -> tuple[FloatArray, Float32Array, BoolArray]:
-    """Level ground under a camera that looks ahead, with things standing on 40 % of it; and where it is bare."""
-    ground = ground_inverse_depth(FRONT, np.eye(3), height_m, stride=1)
-    depth = 1.0 / np.maximum(ground, 1e-3)
-    covered = np.random.default_rng(0).random((HEIGHT // 8, WIDTH // 8)) < 0.4
-    covered_px = np.kron(covered, np.ones((8, 8), np.bool_))
-    scene = np.where(covered_px, depth * np.random.default_rng(1).uniform(0.3, 0.8, depth.shape), depth)
-    return scene, ground_inverse_depth(FRONT, np.eye(3), height_m, stride=2), ~covered_px & (ground > 0)
-
-
-@pytest.mark.parametrize("shift", [False, True])
-@pytest.mark.parametrize("drones", [False, True])
-def test_height_finds_the_ground_under_what_stands_on_it_and_drones_before_it_do_not_count(
-    shift: bool, drones: bool
-) -> None:
-    scene, ground, bare = depth_of_ground(3.0)
-    labels, seen = np.zeros(scene.shape, np.uint8), scene.copy()
-    if drones:
-        labels[HEIGHT // 2 :, : WIDTH // 3] = 1
-        seen[labels > 0] *= 0.2
-    fixed = metric_depth(opened(seen, shift=shift, labels=labels), ground, FRONT.camera)
-    right = (labels == 0) & (bare | (scene < 20.0))
-    np.testing.assert_allclose(fixed[right], (scene / AXIAL_SHARE)[right], rtol=0.02)
-
-
-def test_a_foreign_relative_network_sees_metres_by_height(tmp_path: Path) -> None:
-    """Its image is painted so that it sees level ground, in a unit of its own."""
-    rig, state = rig_of(SIZE), vehicle(height_m=2.0)
-    inverse = ground_inverse_depth(rig.cameras["front"], np.eye(3), 2.0, stride=1)
-    grey = np.round(20 + 200 * inverse / inverse.max()).astype(np.uint8)
-    networks = perception_with(one_channel_depth(tmp_path, output=RELATIVE), scale="height")
-    config = PerceptionConfig(flow="dis", distance="none", scale="height")
-    shown = frames(0.0, {"front": np.repeat(grey[:, :, None], 3, axis=2)})
-    observation = Perception(rig, networks, config).observe(shown, state, level_ground(state))
-    assert observation.reasons == ()
-    rows = slice(SIZE[1] * 3 // 4, None)
-    depth = observation.cameras["front"].depth
-    assert depth is not None
-    np.testing.assert_allclose(z_map(depth, rig.cameras["front"].camera)[rows], 1.0 / inverse[rows], rtol=0.05)
+def test_a_relative_network_is_refused_with_what_to_take_instead(tmp_path: Path) -> None:
+    path = one_channel_depth(tmp_path, output={"depth": {"quantity": "inverse_depth"}})
+    path.write_text(path.read_text().replace("inverse_depth", "inverse_depth\n      unknown: scale_and_shift"))
+    with pytest.raises(ModelError, match=r"someones_depth\.yaml:\d+: .*depth\.unknown: is gone; .*metric"):
+        perception_with(path)

@@ -16,7 +16,7 @@ from flockd.core.config.safety import GateParameters
 from flockd.core.messages import Detection, FloatArray, FrameSet, LearnedSize, Neighbour, PilotOutput, VehicleState
 from flockd.flight.geometry import log_polar_covariance
 from flockd.flight.perception import Observation
-from flockd.flight.perception.maps import KnownSize
+from flockd.flight.perception.interface import KnownSize
 from flockd.flight.pilot import FlockPilot
 from flockd.flight.pilot.size_learner import scale_of
 from flockd.flight.pilot.weave import DURATION_S, PERIOD_S, Weave

@@ -10,7 +10,8 @@ import numpy as np
 
 from flockd.core.messages import Float32Array, FloatArray, Frame, UInt8Array
 from flockd.flight.geometry import RigCamera, ZMap
-from flockd.flight.perception import Crop, Instance, OneByOne, RangeEstimate, SceneMaps
+from flockd.flight.perception import Crop, OneByOne, RangeEstimate, SceneMaps
+from flockd.flight.perception.detection.instances import Instance
 from flockd.sim.cameras.camera_simulator import CameraSimulator
 from flockd.sim.renderer.renderer import Renderer, View, true_flow
 from tests.flight.perception.cameras import SECOND_STAGE

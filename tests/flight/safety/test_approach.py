@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
+from flockd.core.config.safety import GateParameters
 from flockd.core.messages import FloatArray
 from flockd.flight.geometry.level import SAME_SPOT_M
-from flockd.flight.safety import Action, Gate, GateParameters
+from flockd.flight.safety import Action, Gate
 from flockd.flight.safety.approach import stopping_speed, towards_flying_on, towards_neighbours, towards_obstacles
 from flockd.flight.safety.half_planes import nearest_within
 from tests.make import around, request

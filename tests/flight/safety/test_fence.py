@@ -8,8 +8,9 @@ from collections import deque
 import numpy as np
 import pytest
 
+from flockd.core.config.safety import GateParameters
 from flockd.core.messages import FloatArray
-from flockd.flight.safety import Gate, GateParameters, outside_fence, outside_heights
+from flockd.flight.safety import Gate, outside_fence, outside_heights
 from flockd.flight.safety.fence import towards_fence
 from tests.make import around, request
 

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flockd.core.config.safety import GateParameters
 from flockd.core.messages import SECTORS, FloatArray, Setpoint
-from flockd.flight.safety import Action, Gate, GateParameters, Objection, Permission, Surroundings, Verdict
+from flockd.flight.safety import Action, Gate, Objection, Permission, Surroundings, Verdict
 from tests.make import around, request
 
 STILL = (0.0, 0.0)

@@ -7,7 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from flockd.flight.safety import Action, Gate, GateParameters, Objection, Surroundings, Verdict
+from flockd.core.config.safety import GateParameters
+from flockd.flight.safety import Action, Gate, Objection, Surroundings, Verdict
 from tests.flight.safety.test_fence import is_inside, outline
 from tests.make import around, request
 

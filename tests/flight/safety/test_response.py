@@ -9,8 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from flockd.core.config.safety import GateParameters
 from flockd.core.messages import FloatArray
-from flockd.flight.safety import Action, Gate, GateParameters, Surroundings
+from flockd.flight.safety import Action, Gate, Surroundings
 from flockd.flight.safety.response import ResponseMonitor
 from tests.make import around, request
 

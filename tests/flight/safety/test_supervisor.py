@@ -9,6 +9,7 @@ from typing import Any, Literal, NamedTuple, Self
 
 import pytest
 
+from flockd.core.config.safety import SafetyParameters
 from flockd.flight.safety import (
     OFFBOARD,
     Action,
@@ -17,7 +18,6 @@ from flockd.flight.safety import (
     Event,
     Inputs,
     MissionEnd,
-    SafetyParameters,
     State,
     Supervisor,
     link_lost,

@@ -161,7 +161,7 @@ def stubbed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(from_flight, "FlockPilot", StubPilot)
     monkeypatch.setattr(from_flight, "load_side_by_side", lambda config: None)
     points, pixels = np.zeros((0, 3)), np.zeros((0, 2))
-    nothing = PointPairs(points, points, np.zeros(0, np.int64), np.zeros(0, np.str_), pixels, pixels)
+    nothing = PointPairs(points, points, np.zeros(0, np.str_), pixels, pixels)
     monkeypatch.setattr(from_flight, "background_pairs", lambda *_: nothing)
 
 

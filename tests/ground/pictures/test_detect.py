@@ -213,10 +213,6 @@ def test_a_drones_own_camera_is_taken(capsys: Capture, tmp_path: Path) -> None:
     )
     other = ("--config", config, "--camera", "right")
     assert "has no camera 'right'; choose with --camera from front, left" in told(capsys, 2, "detect", NEAR, *other)
-    with config.open("a", encoding="utf-8") as file:
-        file.write("perception: {distance: none}\n")
-    no_second_stage = ("--config", config, *FOV, "--drone-size", "0.7")
-    assert "needs the apparent size, which a second stage" in told(capsys, 2, "detect", NEAR, *no_second_stage)
     assert cv2.imwrite(str(tmp_path / "small.png"), np.zeros((60, 80, 3), np.uint8))
     small = (tmp_path / "small.png", "--config", config, "--camera", "left")
     assert "is 80 x 60 pixels, and the camera of" in told(capsys, 2, "detect", *small)

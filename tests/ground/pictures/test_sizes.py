@@ -14,9 +14,8 @@ from flockd.core.config.perception import PerceptionConfig
 from flockd.core.data import data_path
 from flockd.flight.inference import OnnxModel
 from flockd.flight.perception import load_networks
-from flockd.flight.perception.maps import Crop, RangeEstimate
+from flockd.flight.perception.interface import Crop, RangeEstimate
 from flockd.flight.perception.onnx import OnnxNetworks
-from flockd.flight.perception.requirements import check_roles
 from flockd.ground.datasets.image_files import read_image
 from flockd.ground.pictures.single_frame import KNOWN_LOG_SIZE_SIGMA, UNKNOWN_LOG_SIZE_SIGMA, PictureDetector
 from tests.ground.pictures.photographs import FOV_DEG, RENDERED, truth
@@ -75,7 +74,7 @@ def test_sigma_covers_the_errors_of_airframes_that_no_network_learnt(tmp_path: P
     """Of the two that the renderer holds out: 68 % within one standard deviation, and 95 % within two."""
     _render_world(CropJob(tmp_path / "crops.npz", worlds.TEST[-3], 150, [], measures=True))
     crops, _ = held_out(tmp_path)
-    model = OnnxModel(data_path("models") / "distance_int8.yaml", threads=1, check=check_roles)
+    model = OnnxModel(data_path("models") / "distance_int8.yaml", threads=1)
     out = model.manifest.results["range"].by_column(model.run({"picture": crops["picture"]})["range"])
     off = np.abs(out["log_range_per_focal"] - crops["target"][:, 0])
     doubt = np.exp(out["log_size_sigma"])

@@ -16,7 +16,8 @@ from flockd.cli import main
 from flockd.core.config import DroneConfig
 from flockd.core.messages import EgoMotion, FrameSet, LearnedSize, MissionOrder, PilotOutput, VehicleState
 from flockd.flight.geometry import RangeMap
-from flockd.flight.perception import CameraObservation, Observation
+from flockd.flight.perception import Observation
+from flockd.flight.perception.observation import CameraObservation
 from flockd.flight.pilot import StepTrace
 from flockd.onboard.recording import Recorder
 from flockd.onboard.recording.mcap_file import Note, Record

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import cv2
 import numpy as np
@@ -31,34 +31,27 @@ _FIRST = 50.0
 
 @dataclass(frozen=True)
 class BoxRules:
-    """Rules for a detector's output, from its manifest."""
+    """A detector's thresholds, as its manifest names them."""
 
-    least_probability: float
+    box_probability: float
     overlap: float
-    gain: float
-    large: float
-    small: float
-    no_box: float
+    evidence_gain: float
+    large_box_evidence: float
+    small_box_evidence: float
+    no_box_evidence: float
 
     @classmethod
     def of(cls, manifest: Manifest) -> BoxRules:
-        """Raises ModelError if a threshold is missing in the manifest."""
-        return cls(
-            least_probability=manifest.threshold("box_probability"),
-            overlap=manifest.threshold("overlap"),
-            gain=manifest.threshold("evidence_gain"),
-            large=manifest.threshold("large_box_evidence"),
-            small=manifest.threshold("small_box_evidence"),
-            no_box=manifest.threshold("no_box_evidence"),
-        )
+        """Of a manifest with the role `detector`."""
+        return cls(**{one.name: manifest.thresholds[one.name] for one in fields(cls)})
 
     def evidence(self, box: FloatArray, log_odds: float) -> float:
         """Log odds of a drone, added to the second stage's, for a box (4,) with the detector's ``log_odds``."""
         width = max(float(box[2] - box[0]), 1.0)
         # A small doubtful box counts more, but never more than the most probable one.
-        room = max(self.gain * (_SUREST_ODDS - log_odds), 0.0)
-        small = min(self.small * _share(width, _SMALL_PX), room)
-        return self.gain * log_odds + self.large * _share(width, _LARGE_PX) + small
+        room = max(self.evidence_gain * (_SUREST_ODDS - log_odds), 0.0)
+        small = min(self.small_box_evidence * _share(width, _SMALL_PX), room)
+        return self.evidence_gain * log_odds + self.large_box_evidence * _share(width, _LARGE_PX) + small
 
 
 def _share(width: float, ends: tuple[float, float]) -> float:
@@ -77,7 +70,7 @@ def probable_boxes(
         rules: of the detector.
         scale: pixels of the network's input per pixel of the image, right and down.
     """
-    good = np.flatnonzero(columns["drone_probability"] >= rules.least_probability)
+    good = np.flatnonzero(columns["drone_probability"] >= rules.box_probability)
     right, down, width, height = (
         columns[name][good].astype(float) for name in ("centre_right_px", "centre_down_px", "width_px", "height_px")
     )
@@ -107,7 +100,7 @@ def with_boxes(
         odds: (n,) log odds of each.
         rules: of the detector.
     """
-    left: dict[int, Instance] = {one.label: replace(one, evidence=rules.no_box) for one in instances}
+    left: dict[int, Instance] = {one.label: replace(one, evidence=rules.no_box_evidence) for one in instances}
     free = iter(sorted(set(range(1, UNCLASSED)) - left.keys()))
     found = []
     for box, log_odds in zip(boxes, odds, strict=True):

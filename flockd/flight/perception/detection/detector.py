@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field
 
+import cv2
+import numpy as np
+
 from flockd.core.config.perception import DetectionParameters
-from flockd.core.messages import Detection, Reason, UInt8Array, VehicleState
-from flockd.flight.geometry import RangeMap, Rig
-from flockd.flight.perception.detection.from_depth import candidates_from_depth
+from flockd.core.messages import UNCLASSED, Detection, Reason, UInt8Array, VehicleState
+from flockd.flight.geometry import Rig
 from flockd.flight.perception.detection.instances import Instance
-from flockd.flight.perception.detection.masks import first_stage_labels
 from flockd.flight.perception.detection.nms import Suppressed, suppress
 from flockd.flight.perception.detection.proposals import Proposal, propose_instances, propose_predictions
 from flockd.flight.perception.detection.refinement import Candidate, Cascade
-from flockd.flight.perception.interface import Networks
-from flockd.flight.perception.maps import KnownSize, SceneMaps
+from flockd.flight.perception.interface import KnownSize, Networks, SceneMaps
 from flockd.flight.tracking import Prediction
 
 
@@ -48,18 +48,16 @@ class Detector:
         self,
         images: Mapping[str, UInt8Array],
         scenes: Mapping[str, SceneMaps],
-        depths: Mapping[str, RangeMap],
         vehicle: VehicleState,
         predictions: Sequence[Prediction],
         trace: DetectionTrace,
-        known_size: KnownSize | None = None,
+        known_size: KnownSize | None,
     ) -> Detected:
         """The drones in view, and their masks.
 
         Args:
             images: (h, w, 3) by camera.
             scenes: the first stage's maps of each.
-            depths: (h, w) metres along the ray, of the cameras that have them.
             vehicle: for the attitude.
             predictions: of tracks; the second stage searches there too.
             trace: filled.
@@ -69,13 +67,10 @@ class Detector:
             return Detected((), {})
         rig = Rig({name: self._rig.cameras[name] for name in images})
         stage = self._networks.second_stage
-        if stage is None:
-            trace.candidates += candidates_from_depth(rig, scenes, depths, self._parameters)
-            return _masked(suppress(trace.candidates, self._parameters), scenes)
         rules, cascade = stage.rules, Cascade(self._networks, stage, self._parameters, known_size, rig, images)
         proposals = propose_instances(rig, scenes, rules, self._parameters)
         first = cascade.refine(proposals)
-        sure = stage.thresholds.drone
+        sure = stage.drone_probability
         found = [(c.bearing, c.log_range) for c in first.candidates if c.drone_probability >= sure]
         predicted, unpredicted = propose_predictions(rig, vehicle, predictions, found, rules)
         second = cascade.refine(predicted)
@@ -90,14 +85,37 @@ class Detector:
 def _masked(
     found: Suppressed,
     scenes: Mapping[str, SceneMaps],
-    rejected: Container[Instance] = (),
-    reasons: tuple[Reason, ...] = (),
-    sure: float = 0.0,
+    rejected: Container[Instance],
+    reasons: tuple[Reason, ...],
+    sure: float,
 ) -> Detected:
     """With the masks of the detections that are at least so probable; pixels of the others are of no class."""
     of_sure = {one.label for one in found.detections if one.drone_probability >= sure}
     masks = {}
     for name, scene in scenes.items():
-        labels = {instance: label for instance, label in found.labels_of(name).items() if label in of_sure}
+        labels = {instance: label for instance, label in found.label_of[name].items() if label in of_sure}
         masks[name] = first_stage_labels(scene, labels, rejected)
     return Detected(found.detections, masks, reasons)
+
+
+def first_stage_labels(scene: SceneMaps, label_of: Mapping[int, int], rejected: Container[Instance]) -> UInt8Array:
+    """(h, w) the first stage's instances, with the labels of their detections.
+
+    Instances that the second stage rejects become background, undecided ones `UNCLASSED`.
+    """
+    table = np.full(256, UNCLASSED, np.uint8)
+    table[0] = 0
+    for instance in scene.instances:
+        otherwise = 0 if instance in rejected else UNCLASSED
+        table[instance.label] = label_of.get(instance.label, otherwise)
+    labels = np.zeros_like(scene.labels)
+    part = scene.labelled
+    labels[part] = cv2.LUT(scene.labels[part], table)
+    return labels
+
+
+def without_borders(labels: UInt8Array, border_px: int) -> UInt8Array:
+    """Background within ``border_px`` of a drone becomes `UNCLASSED`: masks and depth maps are least certain there."""
+    drone = cv2.threshold(labels, 0, UNCLASSED, cv2.THRESH_BINARY)[1]
+    wide = cv2.dilate(drone, np.ones((2 * border_px + 1, 2 * border_px + 1), np.uint8))
+    return np.asarray(cv2.bitwise_or(labels, cv2.bitwise_xor(wide, drone)), np.uint8)  # `UNCLASSED` has all bits set

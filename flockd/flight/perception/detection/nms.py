@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,17 +18,12 @@ MAX_DETECTIONS = UNCLASSED - 1
 """Detections in one frame set: the labels that fit in a mask of bytes."""
 
 
-@dataclass(frozen=True, eq=False)
-class Suppressed:
+class Suppressed(NamedTuple):
     """One detection for each drone, and the instances of each."""
 
     detections: tuple[Detection, ...]
-    label_of: Mapping[tuple[str, int], int]
-    """The detection's label, by camera and the label of the first stage's instance."""
-
-    def labels_of(self, camera: str) -> dict[int, int]:
-        """The detections' labels, by the labels of one camera's instances."""
-        return {instance: label for (name, instance), label in self.label_of.items() if name == camera}
+    label_of: Mapping[str, dict[int, int]]
+    """By camera, the detection's label by the label of the first stage's instance."""
 
 
 def suppress(candidates: Sequence[Candidate], parameters: DetectionParameters, sure: float = 0.0) -> Suppressed:
@@ -42,12 +38,12 @@ def suppress(candidates: Sequence[Candidate], parameters: DetectionParameters, s
             groups.append([one])
         else:
             group.append(one)
-    detections, label_of = [], {}
+    detections, label_of = [], defaultdict[str, dict[int, int]](dict)
     for label, group in enumerate(groups[:MAX_DETECTIONS], start=1):
         detections.append(fuse([one for one in group if one.drone_probability >= sure] or group, label))
         for one in group:
             if one.proposal.instance:
-                label_of[(one.proposal.cameras[0], one.proposal.instance.label)] = label
+                label_of[one.proposal.cameras[0]][one.proposal.instance.label] = label
     return Suppressed(tuple(detections), label_of)
 
 

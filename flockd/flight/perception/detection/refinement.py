@@ -13,11 +13,8 @@ from numpy.typing import NDArray
 from flockd.core.config.perception import DetectionParameters
 from flockd.core.messages import BoolArray, FloatArray, IntArray, Reason, ReasonKind, UInt8Array
 from flockd.flight.geometry import Rig, log_polar_covariance, virtual_crops
-from flockd.flight.perception.detection.proposals import Proposal
-from flockd.flight.perception.detection.roi import angles_between, pixel_angles
-from flockd.flight.perception.detection.second_stage import SecondStage
-from flockd.flight.perception.interface import Networks
-from flockd.flight.perception.maps import Crop, KnownSize, RangeEstimate
+from flockd.flight.perception.detection.proposals import Proposal, angles_between, pixel_angles
+from flockd.flight.perception.interface import Crop, KnownSize, Networks, RangeEstimate, SecondStage
 
 LIKELY = 0.5
 """A proposal that is likelier a drone than not is a candidate: the tracker weighs the probability."""
@@ -129,8 +126,8 @@ class Cascade:
     ) -> None:
         """``known_size``: of every drone; None: the network estimates each one's. ``rig``: the cameras that have an
         image, ``images`` (h, w, 3) by camera."""
-        self._network, self._crop_size, self._known_size = network, second_stage.crop_size, known_size
-        self._rules, self._thresholds, self._parameters = second_stage.rules, second_stage.thresholds, parameters
+        self._network, self._known_size = network, known_size
+        self._stage, self._rules, self._parameters = second_stage, second_stage.rules, parameters
         self._rig, self._images = rig, images
         self.reasons: list[Reason] = []
         """Why proposals were dropped."""
@@ -156,7 +153,7 @@ class Cascade:
                 break
             at, estimates = self._estimated(of, at, aims)
             probability = np.minimum(least[at], estimates.drone_probability)
-            rejected[at] = probability <= self._thresholds.another_crop
+            rejected[at] = probability <= self._stage.another_crop_probability
             good = ~rejected[at] & self._is_in_range(estimates)
             at, estimates, probability = at[good], estimates.take(good), probability[good]
             repeats = self._aim(of[at], at, aims, estimates)
@@ -170,11 +167,11 @@ class Cascade:
             at = at[~enough]
         at, estimates = self._with_mirrored(of, np.flatnonzero(settled), aims, shown)
         probability = np.minimum(least[at], estimates.drone_probability)
-        rejected[at] = probability <= self._thresholds.another_crop
+        rejected[at] = probability <= self._stage.another_crop_probability
         likely = np.flatnonzero(~rejected[at] & (probability > LIKELY))
         estimates, across = (
             estimates._replace(drone_probability=probability).take(likely),
-            self._thresholds.bearing_sigma_rad,
+            self._stage.bearing_sigma_rad,
         )
         rows = zip(of[at[likely]], estimates.bearing, *(column.tolist() for column in estimates[1:]), strict=True)
         found = [Candidate(one, bearing, log_r, sigma, across, *rest) for one, bearing, log_r, sigma, *rest in rows]
@@ -185,7 +182,7 @@ class Cascade:
     ) -> tuple[IntArray, Estimates]:
         """The network's estimates from crops of the proposals at these indices, and the indices that have one."""
         directions, range_m = aims.direction[at], aims.range_m[at]
-        views = virtual_crops(self._rig, directions, aims.half_angle[at], self._crop_size)
+        views = virtual_crops(self._rig, directions, aims.half_angle[at], self._stage.crop_size)
         seen = (views.main >= 0).nonzero()[0]
         for one in directions[views.main < 0]:
             self._drop(f"no camera sees the body direction {one.round(3).tolist()}")
@@ -244,7 +241,7 @@ class Cascade:
         estimates = shown.take(at)
         agree = self._is_in_range(others) & (np.minimum(estimates.log_range_sigma, others.log_range_sigma) > 0)
         both = estimates.take(agree).mean(others.take(agree))
-        sigma = np.maximum(self._thresholds.mean_sigma * both.log_range_sigma, self._thresholds.min_log_range_sigma)
+        sigma = np.maximum(self._stage.mean_sigma_factor * both.log_range_sigma, self._stage.min_relative_sigma)
         return at[agree], both._replace(log_range_sigma=sigma)
 
     def _aim(self, proposals: NDArray[Any], at: IntArray, aims: _Aims, estimates: Estimates) -> BoolArray:

@@ -2,6 +2,5 @@
 
 from flockd.flight.perception.flow.dense import DisFlow, OnnxFlow
 from flockd.flight.perception.flow.lucas_kanade import grid_flow
-from flockd.flight.perception.interface import Flow
 
-__all__ = ["DisFlow", "Flow", "OnnxFlow", "grid_flow"]
+__all__ = ["DisFlow", "OnnxFlow", "grid_flow"]

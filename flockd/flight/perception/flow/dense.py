@@ -9,7 +9,6 @@ from flockd.core.messages import Float32Array, UInt8Array
 from flockd.flight.inference.fitting import fit
 from flockd.flight.inference.session import OnnxModel
 from flockd.flight.perception.flow.lucas_kanade import grey
-from flockd.flight.perception.interface import Flow
 
 
 class DisFlow:
@@ -18,14 +17,14 @@ class DisFlow:
     It is exact to a fraction of a pixel if it converges, but loses large motions; a network is the opposite.
     """
 
-    def __init__(self, start: Flow | None = None) -> None:
+    def __init__(self, start: OnnxFlow | None = None) -> None:
         """``start``: the flow that initialises the coarsest scale; None: no motion."""
         self._start = start
         self._idle: list[cv2.DISOpticalFlow] = []
         """Instances not in use: none serves two callers at once. Reusing one's memory saves a third of the time."""
 
     def flow(self, first: UInt8Array, second: UInt8Array) -> Float32Array:
-        """See `Flow`."""
+        """(h, w, 3) RGB twice -> (h, w, 2): the displacement of each pixel of the first image, right and down."""
         before, after = grey(first), grey(second)
         start = np.zeros((*before.shape, 2), np.float32) if self._start is None else self._start.flow(first, second)
         dis = self._idle.pop() if self._idle else cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
@@ -42,7 +41,7 @@ class OnnxFlow:
         self._model = model
 
     def flow(self, first: UInt8Array, second: UInt8Array) -> Float32Array:
-        """See `Flow`."""
+        """(h, w, 3) RGB twice -> (h, w, 2): the displacement of each pixel of the first image, right and down."""
         height, width = first.shape[:2]
         fitting = fit(self._model.manifest, (width, height))
         outputs = self._model.infer({"first": [fitting.enter(first)], "second": [fitting.enter(second)]})

@@ -10,9 +10,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from flockd.core.messages import BoolArray, FloatArray
-from flockd.flight.geometry import RansacResult, RigidTransform, fit_rigid, ransac_rigid, rotation_angle_deg
+from flockd.flight.geometry import RigidTransform, fit_rigid, ransac_rigid, rotation_angle_deg
 from flockd.flight.geometry.robust.kernels import cauchy, tukey
-from flockd.flight.perception.metric_depth import ground_scale
+from flockd.flight.geometry.robust.ransac import RansacResult
 
 TURN = Rotation.from_euler("ZYX", [10.0, -3.0, 2.0], degrees=True)
 SHIFT = np.array([0.5, -0.1, 0.05])
@@ -167,22 +167,3 @@ def test_a_threshold_that_cannot_double_up_to_its_maximum_is_refused(threshold: 
 def test_kernels_weigh_as_the_literature_says(kernel: Callable[[FloatArray, float], FloatArray], half: float) -> None:
     assert kernel(np.array([0.0, half**2]), 2.0) == pytest.approx([1.0, 0.5])
     assert kernel(np.array([4.0 * 2.0**2]), 2.0)[0] == pytest.approx(0.0 if kernel is tukey else 1.0 / 5.0)
-
-
-@pytest.mark.parametrize("shift", [True, False])
-def test_a_line_is_found_although_half_of_the_points_are_wrong(shift: bool) -> None:
-    rng = np.random.default_rng(2)
-    x = rng.uniform(0.1, 1.0, 500)
-    y = 2.5 * x + (0.3 if shift else 0.0) + 0.002 * rng.normal(size=500)
-    y[::2] = rng.uniform(0.0, 3.0, 250)
-    assert ground_scale(x, y, shift=shift) == pytest.approx((2.5, 0.3 if shift else 0.0), abs=0.1)
-
-
-def test_points_without_a_line_have_none() -> None:
-    rng = np.random.default_rng(3)
-    falling, few = np.arange(1.0, 201.0), np.arange(50.0)
-    for x, y in ((rng.uniform(0.0, 1.0, 500), rng.uniform(0.0, 9.0, 500)), (few, few), (falling, 200.0 - falling)):
-        with pytest.raises(ValueError, match="too little flat ground"):
-            ground_scale(x, y, shift=True)
-    with pytest.raises(ValueError, match="too little flat ground"):
-        ground_scale(few[:0], few[:0], shift=True)

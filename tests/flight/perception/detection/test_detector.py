@@ -9,8 +9,7 @@ import pytest
 
 from flockd.core.config.perception import DetectionParameters
 from flockd.core.messages import UNCLASSED, Detection, UInt8Array
-from flockd.flight.perception.detection.detector import DetectionTrace, Detector
-from flockd.flight.perception.detection.masks import without_borders
+from flockd.flight.perception.detection.detector import DetectionTrace, Detector, without_borders
 from tests.flight.pilot.flyer import Flyer, scenario_with
 
 PARAMETERS = DetectionParameters()
@@ -32,7 +31,7 @@ class Scene:
         images = {self.camera: self.frames.frames[self.camera].image if image is None else image}
         detector = Detector(self._flyer.cameras.rig, self._flyer.truth, PARAMETERS)
         scenes = {self.camera: self.maps}
-        found = detector.detect(images, scenes, {}, self.vehicle, (), DetectionTrace())
+        found = detector.detect(images, scenes, self.vehicle, (), DetectionTrace(), None)
         return found.detections, found.masks[self.camera]
 
 

@@ -10,13 +10,15 @@ import pytest
 from flockd.core.config.perception import DetectionParameters
 from flockd.core.messages import Float32Array, FloatArray, UInt8Array
 from flockd.flight.geometry import Rig, RigCamera, WideAngleCamera, ZMap
-from flockd.flight.perception import Instance, SceneMaps, group_instances
+from flockd.flight.perception import SceneMaps, group_instances
 from flockd.flight.perception.detection.boxes import BoxRules, kept_boxes, probable_boxes, with_boxes
+from flockd.flight.perception.detection.instances import Instance
 from flockd.flight.perception.detection.proposals import (
+    Roi,
     propose_instances,
     propose_predictions,
+    rois_of_instances,
 )
-from flockd.flight.perception.detection.roi import Roi, rois_of_instances
 from flockd.flight.tracking import Prediction
 from tests.flight.perception.cameras import SECOND_STAGE
 from tests.make import rig_camera, vehicle
@@ -151,7 +153,10 @@ def test_a_dozen_drones_keep_their_own_pixels_and_the_score_is_the_highest_logit
 
 # A detector's boxes beside the instances of the segmentation.
 
-BOXES = BoxRules(least_probability=0.05, overlap=0.5, gain=0.5, large=4.0, small=3.0, no_box=-2.0)
+BOXES = BoxRules(
+    box_probability=0.05, overlap=0.5, evidence_gain=0.5, large_box_evidence=4.0, small_box_evidence=3.0,
+    no_box_evidence=-2.0,
+)  # fmt: skip
 DRONE = (100.0, 50.0, 140.0, 70.0)
 
 

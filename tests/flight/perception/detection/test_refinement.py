@@ -13,12 +13,12 @@ from pydantic import ValidationError
 from flockd.core.config.perception import DetectionParameters, PerceptionConfig
 from flockd.core.messages import FloatArray
 from flockd.flight.geometry import log_polar
-from flockd.flight.perception import Crop, Instance, Perception, RangeEstimate
+from flockd.flight.perception import Crop, Perception, RangeEstimate
+from flockd.flight.perception.detection.instances import Instance
 from flockd.flight.perception.detection.nms import fuse, suppress
-from flockd.flight.perception.detection.proposals import Proposal
+from flockd.flight.perception.detection.proposals import Proposal, Roi
 from flockd.flight.perception.detection.refinement import Candidate, Estimates
-from flockd.flight.perception.detection.roi import Roi
-from flockd.flight.perception.maps import KnownSize
+from flockd.flight.perception.interface import KnownSize
 from tests.flight.pilot.flyer import Flyer, scenario_with
 
 
@@ -136,7 +136,6 @@ def test_a_flights_detections_are_ranged_by_the_size_that_was_said(flyer: Flyer)
         {"drone_size_m": math.nan},
         {"drone_size_m": 0.35, "drone_size_sigma_m": -0.01},
         {"drone_size_m": 0.35, "drone_size_sigma_m": 0.2},
-        {"drone_size_m": 0.35, "distance": "none"},
     ],
 )
 def test_sizes_that_cannot_be_are_refused(values: dict[str, object]) -> None:

@@ -1,11 +1,11 @@
-"""What each role of perception requires of a model's manifest: inputs, outputs, columns, thresholds, crop."""
+"""What each role requires of a model's manifest: inputs, outputs, columns, thresholds, crop."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
-from flockd.core.choices import ROLES, Role
+from flockd.core.choices import Role
 from flockd.flight.inference.manifest import Fault, Manifest
 
 Bounds = tuple[float, float]
@@ -51,8 +51,7 @@ REQUIREMENTS: Mapping[Role, Requirements] = {
         outputs=("drone", "offset"),
         optional_inputs=_GEOMETRY,
         thresholds={
-            "proposal_logit": _LOGIT,  # from it pixels make proposals, where a second stage refuses what is no drone
-            "proposal_logit_alone": _LOGIT,  # from it pixels are a drone's, where there is no second stage
+            "proposal_logit": _LOGIT,  # from it pixels make proposals: the second stage refuses what is no drone
         },
         map_stride=True,
     ),
@@ -95,16 +94,10 @@ REQUIREMENTS: Mapping[Role, Requirements] = {
 
 def check_roles(manifest: Manifest) -> Iterator[Fault]:
     """Faults of a manifest: what its roles require and it lacks, and entries that no role knows."""
-    known: list[Requirements] = []
-    for index, name in enumerate(manifest.roles):
-        role = next((role for role in ROLES if role == name), None)
-        if role is None:
-            yield Fault(("roles", index), f"{name} is not a role; the roles are {', '.join(ROLES)}")
-            return
-        known.append(REQUIREMENTS[role])
+    for role in manifest.roles:
         yield from _faults_of_tensors(manifest, role, REQUIREMENTS[role])
         yield from _faults_of_numbers(manifest, role, REQUIREMENTS[role])
-    yield from _unknown_to_all(manifest, known)
+    yield from _unknown_to_all(manifest, [REQUIREMENTS[role] for role in manifest.roles])
 
 
 def _faults_of_tensors(manifest: Manifest, role: Role, needed: Requirements) -> Iterator[Fault]:
