@@ -37,7 +37,7 @@ LINES = {
     "tools/training": 4_330,
 }
 """Lines of Python below a folder."""
-FILES = {"flockd": 324}
+FILES = {"flockd": 325}
 NUMBERS_OF_FLIGHT = 218
 """In constants of the modules of `flockd/flight`."""
 SLACK = 0.02

@@ -7,7 +7,7 @@ from flockd.flight.geometry.ground import ground_inverse_depth
 from flockd.flight.geometry.ground_fit import GroundSamples, fit_ground
 from flockd.flight.geometry.pairs import PointPairs, grid_pixels, lift_matches
 from flockd.flight.geometry.polar import log_polar, log_polar_covariance, log_polar_residual
-from flockd.flight.geometry.rig import Rig, RigCamera, build_rig
+from flockd.flight.geometry.rig import R_FRD_RDF, Rig, RigCamera, build_rig
 from flockd.flight.geometry.rigid_fit import fit_rigid
 from flockd.flight.geometry.robust.ransac import ransac_rigid
 from flockd.flight.geometry.rotations import (
@@ -24,6 +24,7 @@ from flockd.flight.geometry.transform import RigidTransform
 from flockd.flight.geometry.virtual_camera import VirtualCrops, virtual_crops
 
 __all__ = [
+    "R_FRD_RDF",
     "Camera",
     "GroundSamples",
     "PinholeCamera",

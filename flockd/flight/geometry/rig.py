@@ -14,8 +14,8 @@ from flockd.flight.geometry.cameras import Camera, PinholeCamera, WideAngleCamer
 from flockd.flight.geometry.rotations import rotation_from_euler
 from flockd.flight.geometry.transform import RigidTransform
 
-# A camera that faces forward: its right is the body's right, its down the body's down, its optical axis forward.
-_R_FRD_RDF = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+R_FRD_RDF = np.eye(3)[[2, 0, 1]]
+"""``R_body_camera`` of a camera that faces forward: the body's forward, right and down are its z, x and y."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,5 +86,5 @@ def _build_camera(config: CameraConfig) -> RigCamera:
     return RigCamera(
         name=config.name,
         camera=model(matrix, config.size_px, intrinsics.distortion),
-        T_body_camera=RigidTransform(turn @ _R_FRD_RDF, np.array(extrinsics.position_m)),
+        T_body_camera=RigidTransform(turn @ R_FRD_RDF, np.array(extrinsics.position_m)),
     )

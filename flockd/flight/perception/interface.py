@@ -5,7 +5,6 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple, Protocol, TypeVar
 
 import cv2
@@ -31,12 +30,6 @@ class SceneMaps:
     labels: UInt8Array
     """(h, w) 0 for background, then one value for each drone."""
     instances: tuple[Instance, ...]
-
-    @cached_property
-    def labelled(self) -> tuple[slice, slice]:
-        """The smallest part of the image, at least one pixel, that contains all labels: they are few."""
-        left, top, width, height = cv2.boundingRect(self.labels)
-        return slice(top, top + max(height, 1)), slice(left, left + max(width, 1))
 
 
 class Crop(NamedTuple):

@@ -7,14 +7,10 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import Any
 
-import numpy as np
 import yaml
 
 from flockd.core.config.rig import CameraConfig, ExtrinsicsConfig, MeasurementConfig
-from flockd.flight.geometry import RigidTransform, euler_from_rotation
-
-_R_FRD_RDF = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-"""``R_body_camera`` of a camera that is mounted without any turn."""
+from flockd.flight.geometry import R_FRD_RDF, RigidTransform, euler_from_rotation
 
 
 def measured_today(**facts: Any) -> MeasurementConfig:
@@ -24,7 +20,7 @@ def measured_today(**facts: Any) -> MeasurementConfig:
 
 def extrinsics_of(T_body_camera: RigidTransform, measured: MeasurementConfig) -> ExtrinsicsConfig:
     """A mounting as configuration: ten thousandths of a degree, hundredths of a millimetre."""
-    roll, pitch, yaw = euler_from_rotation(T_body_camera.rotation @ _R_FRD_RDF.T)
+    roll, pitch, yaw = euler_from_rotation(T_body_camera.rotation @ R_FRD_RDF.T)
     x, y, z = (round(float(value), 5) + 0.0 for value in T_body_camera.translation)
     roll, pitch, yaw = (round(math.degrees(angle), 4) + 0.0 for angle in (roll, pitch, yaw))
     return ExtrinsicsConfig(position_m=(x, y, z), yaw_deg=yaw, pitch_deg=pitch, roll_deg=roll, measured=measured)

@@ -12,7 +12,7 @@ import numpy as np
 
 from flockd.core.config.perception import DIS, PerceptionConfig
 from flockd.core.messages import Detection, FloatArray, Frame, FrameSet, UInt8Array, VehicleState
-from flockd.flight.geometry import Camera, PinholeCamera, Rig, RigCamera, RigidTransform, WideAngleCamera
+from flockd.flight.geometry import R_FRD_RDF, Camera, PinholeCamera, Rig, RigCamera, RigidTransform, WideAngleCamera
 from flockd.flight.perception import Networks, Perception, load_networks
 from flockd.flight.perception.detection.detector import DetectionTrace
 from flockd.flight.perception.detection.proposals import angles_between
@@ -21,8 +21,6 @@ from flockd.flight.perception.detection.refinement import Candidate
 MAX_SIDE_PX = 1280
 """Larger pictures are resized to this before the networks: they were trained on cameras of 640 pixels."""
 WIDEST_PINHOLE_DEG = 100.0
-_R_BODY_CAMERA = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-"""Rotation of a camera that faces forward: optical right-down-forward axes to the body's forward-right-down."""
 _MAX_INSTANCE = 2.0
 """An instance's longer side over the drone's apparent size, for it to be of this drone alone: masks of soft pictures
 lack thin arms and propellers, which the first stage has, but it may take several drones for one."""
@@ -117,7 +115,7 @@ class PictureDetector:
         if camera.size != (width, height):
             image = np.asarray(cv2.resize(image, camera.size, interpolation=cv2.INTER_AREA), np.uint8)
         if self._mounted is None or self._mounted.camera is not camera:  # one object, as rays are cached by it
-            self._mounted = RigCamera("camera", camera, RigidTransform(_R_BODY_CAMERA, np.zeros(3)))
+            self._mounted = RigCamera("camera", camera, RigidTransform(R_FRD_RDF, np.zeros(3)))
         config = self._config
         frames = FrameSet(0.0, {"camera": Frame("camera", np.ascontiguousarray(image), 0.0, 0)})
         while True:
@@ -151,7 +149,7 @@ class PictureDetector:
             left, top, wide, high = cv2.boundingRect((mask == one.label).astype(np.uint8))
             boxes += [np.array([left, top, left + wide, top + high], np.float64)] if wide else []
         if not boxes:  # no mask, or a nearer drone's covers it
-            centre = camera.project(one.position[None] @ _R_BODY_CAMERA)[0]
+            centre = camera.project(one.position[None] @ R_FRD_RDF)[0]
             boxes.append(np.clip([*(centre - size_px / 2), *(centre + size_px / 2)], 0, np.tile(camera.size, 2)))
         box = np.concatenate([np.min(boxes, axis=0)[:2], np.max(boxes, axis=0)[2:]])
         x0, y0, x1, y1 = (float(value) for value in box / np.tile(scale, 2))

@@ -12,7 +12,7 @@ from flockd.core.config.perception import DetectionParameters
 from flockd.core.messages import UNCLASSED, Detection, Reason, UInt8Array, VehicleState
 from flockd.flight.geometry import Rig
 from flockd.flight.perception.detection.instances import Instance
-from flockd.flight.perception.detection.nms import Suppressed, suppress
+from flockd.flight.perception.detection.nms import suppress
 from flockd.flight.perception.detection.proposals import Proposal, propose_instances, propose_predictions
 from flockd.flight.perception.detection.refinement import Candidate, Cascade
 from flockd.flight.perception.interface import KnownSize, Networks, SceneMaps
@@ -67,35 +67,24 @@ class Detector:
             return Detected((), {})
         rig = Rig({name: self._rig.cameras[name] for name in images})
         stage = self._networks.second_stage
-        rules, cascade = stage.rules, Cascade(self._networks, stage, self._parameters, known_size, rig, images)
-        proposals = propose_instances(rig, scenes, rules, self._parameters)
+        cascade, sure = Cascade(self._networks, self._parameters, known_size, rig, images), stage.drone_probability
+        proposals = propose_instances(rig, scenes, stage.rules, self._parameters)
         first = cascade.refine(proposals)
-        sure = stage.drone_probability
         found = [(c.bearing, c.log_range) for c in first.candidates if c.drone_probability >= sure]
-        predicted, unpredicted = propose_predictions(rig, vehicle, predictions, found, rules)
+        predicted, unpredicted = propose_predictions(rig, vehicle, predictions, found, stage.rules)
         second = cascade.refine(predicted)
         candidates = [*first.candidates, *second.candidates]
-        none = {proposal.instance for proposal in first.rejected if proposal.instance}
         trace.proposals += [*proposals, *predicted]
         trace.candidates += candidates
-        reasons = (*unpredicted, *cascade.reasons)
-        return _masked(suppress(candidates, self._parameters, sure), scenes, none, reasons, sure)
-
-
-def _masked(
-    found: Suppressed,
-    scenes: Mapping[str, SceneMaps],
-    rejected: Container[Instance],
-    reasons: tuple[Reason, ...],
-    sure: float,
-) -> Detected:
-    """With the masks of the detections that are at least so probable; pixels of the others are of no class."""
-    of_sure = {one.label for one in found.detections if one.drone_probability >= sure}
-    masks = {}
-    for name, scene in scenes.items():
-        labels = {instance: label for instance, label in found.label_of[name].items() if label in of_sure}
-        masks[name] = first_stage_labels(scene, labels, rejected)
-    return Detected(found.detections, masks, reasons)
+        detections, label_of = suppress(candidates, self._parameters, sure)
+        # Only the pixels of sure detections are a drone's; those of the others are of no class.
+        of_sure = {one.label for one in detections if one.drone_probability >= sure}
+        none = {proposal.instance for proposal in first.rejected if proposal.instance}
+        masks = {}
+        for name, scene in scenes.items():
+            labels = {instance: label for instance, label in label_of[name].items() if label in of_sure}
+            masks[name] = first_stage_labels(scene, labels, none)
+        return Detected(detections, masks, (*unpredicted, *cascade.reasons))
 
 
 def first_stage_labels(scene: SceneMaps, label_of: Mapping[int, int], rejected: Container[Instance]) -> UInt8Array:
@@ -109,7 +98,8 @@ def first_stage_labels(scene: SceneMaps, label_of: Mapping[int, int], rejected: 
         otherwise = 0 if instance in rejected else UNCLASSED
         table[instance.label] = label_of.get(instance.label, otherwise)
     labels = np.zeros_like(scene.labels)
-    part = scene.labelled
+    left, top, width, height = cv2.boundingRect(scene.labels)  # the smallest part with all labels: they are few
+    part = np.s_[top : top + max(height, 1), left : left + max(width, 1)]
     labels[part] = cv2.LUT(scene.labels[part], table)
     return labels
 

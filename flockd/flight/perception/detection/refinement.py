@@ -14,7 +14,7 @@ from flockd.core.config.perception import DetectionParameters
 from flockd.core.messages import BoolArray, FloatArray, IntArray, Reason, ReasonKind, UInt8Array
 from flockd.flight.geometry import Rig, log_polar_covariance, virtual_crops
 from flockd.flight.perception.detection.proposals import Proposal, angles_between, pixel_angles
-from flockd.flight.perception.interface import Crop, KnownSize, Networks, RangeEstimate, SecondStage
+from flockd.flight.perception.interface import Crop, KnownSize, Networks, RangeEstimate
 
 LIKELY = 0.5
 """A proposal that is likelier a drone than not is a candidate: the tracker weighs the probability."""
@@ -118,7 +118,6 @@ class Cascade:
     def __init__(
         self,
         network: Networks,
-        second_stage: SecondStage,
         parameters: DetectionParameters,
         known_size: KnownSize | None,
         rig: Rig,
@@ -127,7 +126,7 @@ class Cascade:
         """``known_size``: of every drone; None: the network estimates each one's. ``rig``: the cameras that have an
         image, ``images`` (h, w, 3) by camera."""
         self._network, self._known_size = network, known_size
-        self._stage, self._rules, self._parameters = second_stage, second_stage.rules, parameters
+        self._stage, self._rules, self._parameters = network.second_stage, network.second_stage.rules, parameters
         self._rig, self._images = rig, images
         self.reasons: list[Reason] = []
         """Why proposals were dropped."""
