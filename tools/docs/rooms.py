@@ -26,7 +26,7 @@ PURPOSES: Mapping[str, str] = {
     "obstacles": "map, way around",
     "flocking": "the law, passing",
     "safety": "supervisor, gate",
-    "perception": "detection, flow, depth",
+    "perception": "drones, flow, depth",
     "tracking": "neighbours over time",
     "inference": "networks, manifests",
     "geometry": "cameras, own motion",

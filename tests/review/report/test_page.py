@@ -242,15 +242,15 @@ BEGUN = {"began": "2026-11-21T09:05:00+00:00", "version": "0.1.0", "scenario": "
         (
             _flight(perception="truth"),
             "Five drones flew 110 s with exact states and stayed one flock|No camera images were kept|No stage of this "
-            "flight was timed|it stands alone",
+            "flight was timed|there is no companion flight",
             "95th percentile",
         ),
-        (_flight(duration_s=20.0), "this flight was too short|On the circle, t < 66 s", "Straight on"),
+        (_flight(duration_s=20.0), "This flight was too short|On the circle, t < 66 s", "Straight on"),
         (_flight(drones=1, duration_s=10.0), "One drone flew 10 s by sight", "Closest"),
         (_moved(_flight(duration_s=20.0), 0, -40.0), "but did not stay one flock", "and stayed one flock"),
         (
             _moved(_of(_flight(drones=3, duration_s=20.0), **BEGUN), 2, -2.25),
-            "begun 2026-11-21 09:05 UTC, flockd 0.1.0|–6.2 m|<script>alert|are of 5 drones, this flight is of 3",
+            "begun 2026-11-21 09:05 UTC, flockd 0.1.0|–6.2 m|<script>alert|flew 5 drones, this flight has 3",
             "Five drones",
         ),
     ],
