@@ -57,6 +57,11 @@ class OnnxNetworks(OneByOne):
         cv2.setNumThreads(share)
         self._flow = self._build_flow(config)
         self._depth = self._models.open(config.depth, "depth")
+        if config.scale == "height" and "geometry" not in self._depth.manifest.contents:
+            raise ModelError(
+                f"perception.scale: depth model {config.depth!r} takes no height, as it has no input `geometry`; write "
+                "network, which takes its depth as it is, or choose another model"
+            )
         self._segmentation = self._models.open(config.segmentation, "segmentation")
         self._distance = self._models.open(config.distance, "distance")
         self._detector = None if config.detector == NO_MODEL else self._models.open(config.detector, "detector")

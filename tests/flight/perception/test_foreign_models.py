@@ -85,3 +85,9 @@ def test_a_relative_network_is_refused_with_what_to_take_instead(tmp_path: Path)
     path.write_text(path.read_text().replace("inverse_depth", "inverse_depth\n      unknown: scale_and_shift"))
     with pytest.raises(ModelError, match=r"someones_depth\.yaml:\d+: .*depth\.unknown: is gone; .*metric"):
         perception_with(path)
+
+
+def test_a_network_that_takes_no_height_is_refused_for_a_scale_by_height(tmp_path: Path) -> None:
+    path = one_channel_depth(tmp_path, output={})
+    with pytest.raises(ModelError, match=r"perception\.scale: .*someones_depth.*no input `geometry`; write network"):
+        perception_with(path)
