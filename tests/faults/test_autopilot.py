@@ -117,6 +117,8 @@ async def test_an_autopilot_that_refuses_without_a_word_is_told_as_such(
             asked_s = clock()
             await ship.until_event("the autopilot was asked for hold, which was refused for now without a reason")
             reacted("silent-autopilot", clock() - asked_s)
+            autopilot.refuses = lambda mode: mode == "LAND"
+            await ship.until_event("the autopilot was asked for land, which was refused for now without a reason")
             autopilot.refuses = lambda mode: False
             await ship.until_mode("LAND")
 

@@ -20,6 +20,8 @@ REPLY_S = 1.0
 """Longest time for the autopilot's reply to one request, with its own repetitions."""
 RETRY_S = 0.3
 """Time before a request that changed nothing is repeated."""
+FROM_HOLD_S = 5.0
+"""Longest time for which landing or return is requested from the Hold that comes before it."""
 SAME_AGAIN_S = 30.0
 """Time before the same answer is logged again: a dead autopilot is asked once a second, for ever."""
 
@@ -42,17 +44,27 @@ class AutopilotRequests:
             "return": self._link.return_home,
             "land": self._link.land,
         }
+        now = asyncio.get_running_loop().time
         while True:
             takeover = self.takeover
             if takeover is None:
                 self._logged = ""
                 await asyncio.sleep(POLL_S)
                 continue
-            await self._ask(takeover, asks[takeover])
+            until_s, self.asking = now() + FROM_HOLD_S, True
+            agreed = await self._agrees(takeover, asks[takeover])
+            # Hold ends the flight, and the control loop's request with it. Any other mode is the pilot's choice.
+            while not agreed and takeover != "hold" and self._holds() and now() < until_s:
+                await asyncio.sleep(RETRY_S)
+                agreed = self._holds() and await self._agrees(takeover, asks[takeover])
+            self.asking = False
             await self._wait_for_another(takeover)
 
-    async def _ask(self, takeover: Takeover, ask: Callable[[], Awaitable[None]]) -> None:
-        self.asking = True
+    def _holds(self) -> bool:
+        return self._link.status().flight_mode == "hold"
+
+    async def _agrees(self, takeover: Takeover, ask: Callable[[], Awaitable[None]]) -> bool:
+        """Sends one request, and logs the answer."""
         try:
             async with asyncio.timeout(REPLY_S):
                 await ask()
@@ -62,8 +74,8 @@ class AutopilotRequests:
             self._log(f"the autopilot was asked for {takeover} and has not responded yet")
         else:
             self._log(f"the autopilot was asked for {takeover}, and agreed")
-        finally:
-            self.asking = False
+            return True
+        return False
 
     def _log(self, answer: str) -> None:
         """Logs an answer as an event, unless it repeats the last one."""
