@@ -1,1 +1,1 @@
-"""During a flight, for people: the drones that are there, orders, the page, ROS 2."""
+"""For people during a flight: the fleet's state, orders, the page, ROS 2."""

@@ -1,4 +1,4 @@
-"""What a watcher may ask one drone over telemetry: each question waits for the reply. Nothing that flies asks."""
+"""Queries of a watcher to one drone over telemetry. Code that flies does not use them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ ANSWER_S = 3.0
 PICTURE_S = 1.5
 AGAIN_S = 0.1
 MAX_REPLY_BYTES = 1 << 16
-"""Ten times a drone's configuration, and twice a small picture."""
+"""Largest reply: ten times a drone's configuration, twice a small picture."""
 MAX_PICTURE_PX = 1024
 
 
@@ -29,19 +29,19 @@ class ClockReading(NamedTuple):
     delay_s: float
     """There and back."""
     ahead_s: float
-    """The drone's wall clock less this computer's, known to half of the delay."""
+    """The drone's wall clock minus this computer's, accurate to half of the delay."""
 
 
 class DroneQueries:
-    """Queries to drones, each by its key `fleet/drone`; None where no valid reply comes in time.
+    """Queries to drones by their keys `fleet/drone`. The result is None if no valid reply comes in time.
 
-    Every call waits for the reply, up to ``ANSWER_S``: not for an event loop.
+    Every call waits up to ``ANSWER_S`` for the reply: do not call it on an event loop.
     """
 
     def __init__(self, session: zenoh.Session, orders: zenoh.Session, prefix: str = PREFIX) -> None:
-        """``orders``: another connection, or the same; nothing else goes over it. Both stay their owner's.
+        """``orders``: the session for orders alone, which may be the same. The caller closes both.
 
-        ``prefix``: of the keys; another than drones' for what replies as they do.
+        ``prefix``: of the keys; a simulator that replies like a drone has another one.
         """
         self._session, self._orders, self._prefix = session, orders, prefix
         self._name, self._numbers = secrets.token_hex(8), itertools.count(1)
@@ -49,10 +49,10 @@ class DroneQueries:
     def ask(
         self, drone: str, identity: str, command: str, operator: str, order: Mapping[str, object] | None = None
     ) -> AnswerMessage | None:
-        """The answer to an operator's command. ``identity``: that of its liveliness token.
+        """The answer to an operator's command. ``identity``: of the drone's liveliness token.
 
-        The drone's clock is asked first, again and again: a connection that has just been made does not know yet what
-        the drone replies to. The command itself is sent once.
+        First it queries the drone's clock, repeatedly, because a new connection does not know the drone's keys yet. It
+        sends the command once.
         """
         until_s, session = time.monotonic() + ANSWER_S, self._orders
         while (now := self.message(f"{drone}/time", TimeMessage, session=session)) is None:
@@ -78,7 +78,7 @@ class DroneQueries:
         return about
 
     def clock(self, drone: str) -> ClockReading | None:
-        """How long the link takes, and how far the clocks are apart."""
+        """Delay of the link, and difference of the clocks."""
         sent_s, began_s = time.time(), time.monotonic()
         reply = self.message(f"{drone}/time", TimeMessage)
         delay_s = time.monotonic() - began_s
@@ -87,13 +87,13 @@ class DroneQueries:
         return ClockReading(delay_s, reply["wall_s"] - (sent_s + delay_s / 2))
 
     def image(self, drone: str, camera: str) -> bytes | None:
-        """A small JPEG of what a camera sees."""
+        """A small JPEG of a camera's image."""
         image = self._reply(f"{drone}/image/{camera}", timeout_s=PICTURE_S)
         size_px = None if image is None else jpeg_size(image)
         return image if size_px is not None and max(size_px) <= MAX_PICTURE_PX else None
 
     def message(self, key: str, kind: type, payload: bytes = b"", *, session: zenoh.Session | None = None) -> Any:
-        """The reply to a query for `fleet/drone/...`, where it is a message of this kind."""
+        """The reply to a query for `fleet/drone/...`; None: it is no message of this kind."""
         raw = self._reply(key, payload, session=session)
         if raw is None:
             return None
@@ -105,7 +105,7 @@ class DroneQueries:
     def _reply(
         self, key: str, payload: bytes = b"", *, timeout_s: float = ANSWER_S, session: zenoh.Session | None = None
     ) -> bytes | None:
-        """The first reply that is not too long. What is asked over the connection for orders goes first."""
+        """The first reply that is not too long; None: no reply."""
         priority = zenoh.Priority.DATA_LOW if session is None else zenoh.Priority.REAL_TIME
         for reply in (session or self._session).get(
             f"{self._prefix}/{key}", payload=payload, timeout=timeout_s, priority=priority

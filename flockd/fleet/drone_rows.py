@@ -1,4 +1,4 @@
-"""What is shown of each drone, on the page and in ROS 2: one JSON object, from what a watcher heard of it."""
+"""Rows of the drones for the page and ROS 2: one JSON object for each drone, from its telemetry."""
 
 from __future__ import annotations
 
@@ -13,12 +13,13 @@ from flockd.fleet.watcher import Heard, Watched, ambiguity
 from flockd.onboard.telemetry.topics import AboutMessage, is_name
 
 GONE, QUIET = "gone", "quiet"
-"""In the place of a state: the drone's process has ended or cannot be reached, or it publishes nothing."""
+"""Shown instead of a state if the drone's process has ended or cannot be reached, or publishes nothing."""
 WORST_FIRST = (GONE, QUIET, "asking", "hover", "silent", "degraded", "idle", "ready", "normal")
 
 
 def status_rows(drones: Iterable[Watched], now_s: float) -> list[dict[str, Any]]:
-    """One row for each drone, as JSON, the worst first: names of several drones, then states; names of none last.
+    """One JSON row for each drone, the worst first: names that several drones share, then by state; names without a
+    drone last.
 
     ``now_s``: on the watcher's clock.
     """
@@ -70,7 +71,7 @@ def _status_row(drone: Watched, now_s: float) -> dict[str, Any]:
 
 
 def _operators(orders: list[dict[str, Any]]) -> str | None:
-    """That several operators command it, and what they asked."""
+    """A sentence if several operators command the drone, with their orders."""
     if len(orders) < 2:
         return None
     told = ", ".join(f"{order['operator']:.80} ({order['command']:.20})" for order in orders)
@@ -78,7 +79,7 @@ def _operators(orders: list[dict[str, Any]]) -> str | None:
 
 
 def _told(why: str) -> str:
-    """What is wrong with a message, and its likely cause."""
+    """The fault of a message, and its likely cause."""
     return f"{why}; it may run another version of flockd" if why.endswith("is missing") else why
 
 
@@ -89,21 +90,21 @@ HISTORY_COLUMNS = (
 """Columns of a drone's history: seconds, metres from the map's origin, metres, m/s, shares, degrees Celsius, steps a
 second, milliseconds, seconds."""
 MAX_CORNERS = 200
-"""The most corners of a drawn fence."""
+"""Largest number of corners of a drawn fence."""
 MAX_CAMERAS = 16
-"""The most cameras of one drone whose pictures are offered."""
+"""Largest number of cameras of one drone with pictures."""
 _FARTHEST_M = 1e6
 
 
 @dataclass(frozen=True)
 class Known:
-    """What a drone has answered to queries."""
+    """Replies of a drone to queries."""
 
     about: AboutMessage | None = None
     delay_s: float | None = None
     """Round-trip delay of the link."""
     clock_s: float | None = None
-    """The drone's wall clock less this computer's."""
+    """The drone's wall clock minus this computer's."""
 
 
 def drone_rows(drones: Iterable[Watched], known: Mapping[str, Known], now_s: float) -> dict[str, Row]:
@@ -123,7 +124,7 @@ def drone_rows(drones: Iterable[Watched], known: Mapping[str, Known], now_s: flo
 
 
 def history_row(row: Row, time_s: float) -> list[float | None]:
-    """The part of a row that is kept for trails and curves: `HISTORY_COLUMNS`."""
+    """The values of a row for trails and curves: `HISTORY_COLUMNS`."""
     north, east = row["position_ne"] or (None, None)
     home = row["home_ne"] or (0.0, 0.0)
     if north is not None and east is not None:
@@ -135,7 +136,7 @@ def history_row(row: Row, time_s: float) -> list[float | None]:
 
 
 def _row(drone: Watched, status: Mapping[str, Any], known: Known, now_s: float) -> Row:
-    """Everything is null that is not known, or too old to be true now."""
+    """A row; unknown and outdated values are null."""
 
     def of(topic: str) -> Mapping[str, Any]:
         return drone.message(topic, now_s) or {}
@@ -178,7 +179,7 @@ def _row(drone: Watched, status: Mapping[str, Any], known: Known, now_s: float) 
 
 
 def _silence(drone: Watched, state: str, now_s: float) -> list[str]:
-    """Why there is no news of it."""
+    """Why no messages of a drone arrive."""
     if state not in {GONE, QUIET}:
         return []
     last_s = max((heard.time_s for heard in drone.topics.values()), default=None)
@@ -189,21 +190,21 @@ def _silence(drone: Watched, state: str, now_s: float) -> list[str]:
 
 
 def _ago(seconds: float) -> str:
-    """Coarse, so that a row seldom changes."""
+    """A coarse age, so that a row seldom changes."""
     if seconds < 10:
         return "a few seconds"
     return f"{10 * int(seconds // 10)} s" if seconds < 120 else f"{int(seconds // 60)} min"
 
 
 def _rate(heard: Heard | None, now_s: float) -> float | None:
-    """New messages a second; None where they have ceased."""
+    """New messages per second; None: they have ceased."""
     if heard is None or not heard.period_s or heard.new_s is None:
         return None
     return None if now_s - heard.new_s > max(3.0 * heard.period_s, 1.5) else round(1.0 / heard.period_s, 2)
 
 
 def _seen(neighbour: Mapping[str, Any]) -> Row:
-    """A neighbour as its observer sees it, metres north, east and down from that one."""
+    """A neighbour, metres north, east and down from its observer."""
     return {
         "track": neighbour["track"],
         "ned": _vector(neighbour["position_ned"], size=3),
@@ -214,9 +215,9 @@ def _seen(neighbour: Mapping[str, Any]) -> Row:
 
 
 def _cameras(drone: Watched, computer: Mapping[str, Any], configuration: Mapping[str, Any]) -> dict[str, str | None]:
-    """What is wrong with each that can be asked for a picture.
+    """The faults of all cameras whose pictures can be queried.
 
-    A simulated drone, which has no computer to tell of, has those of its rig.
+    A simulated drone publishes no camera status: all cameras of its rig count.
     """
     found = [(name, camera["fault"]) for name, camera in computer.get("cameras", {}).items()]
     rig = configuration.get("rig")
@@ -226,7 +227,7 @@ def _cameras(drone: Watched, computer: Mapping[str, Any], configuration: Mapping
 
 
 def _vector(values: object, digits: int = 2, *, size: int = 2) -> list[float] | None:
-    """The first of a list from a peer; None where one of them is missing."""
+    """The first numbers of a peer's list; None: one of them is missing."""
     if not isinstance(values, list) or len(values) < size:
         return None
     first = values[:size]
@@ -240,7 +241,7 @@ def _rounded(value: float | None, digits: int) -> float | None:
 
 
 def _offset(origin: list[float] | tuple[float, float] | None, home_deg: list[float] | None) -> list[float] | None:
-    """(2,) metres from the map's origin to a drone's home; None where the home is not known."""
+    """(2,) metres from the map's origin to a drone's home; None: home is not known."""
     if origin is None or home_deg is None:
         return None
     north_m, east_m = metres_a_degree(origin[0])
@@ -265,7 +266,7 @@ def _sum(one: list[float] | None, other: list[float] | None) -> list[float] | No
 
 
 def _fence(configuration: Mapping[str, Any]) -> Row | None:
-    """Around the drone's home, from its configuration, which a peer sent: None for what is no fence."""
+    """The fence around the drone's home, from the configuration that the drone sent; None: it has no valid fence."""
     gate = _section(configuration, "safety").get("gate")
     if not isinstance(gate, dict):
         return None

@@ -1,4 +1,4 @@
-"""The fleet as its telemetry has it now."""
+"""The present state of a fleet, from its telemetry."""
 
 from __future__ import annotations
 
@@ -16,40 +16,40 @@ from flockd.fleet.watcher import FleetWatcher, Watched
 from flockd.onboard.telemetry.topics import AnswerMessage, is_name
 
 Event = tuple[float, str, str]
-"""When it was heard, of which drone by its key, and what it says."""
+"""Time of arrival, key of the drone, and text."""
 
 ASK_EVERY_S = 5.0
 """Interval of asking each drone for its clocks, and for its configuration until it has answered."""
 ASK_SILENT_S = 60.0
-"""The longest interval of asking a drone that never answers."""
+"""Longest interval of queries to a drone that does not answer."""
 LOOK_EVERY_S = 0.5
-"""Interval of looking for new drones, and of rows for the history."""
+"""Interval of checks for new drones, and of rows of the history."""
 HISTORY_S = 300.0
 MANY = 100
-"""Malformed messages that a single fault or two may cause."""
+"""Number of malformed messages that a few faults may cause; more are reported."""
 CLOCK_READINGS = 8
-"""Of this many last readings the one with the least delay says how far the clocks are apart."""
+"""Number of last readings; the one with the least delay gives the difference of the clocks."""
 ROWS_S = 0.1
-"""Rows are computed anew after this time."""
+"""Time after which rows are computed again."""
 _ASKING_THREADS = 16
 
 
 class LiveFleet:
-    """What the page and the bridge to ROS 2 show, on the event loop except for what waits.
+    """The state for the page and the bridge to ROS 2. Runs on the event loop; queries wait on threads.
 
-    It asks drones for their clocks on threads of its own between ``__enter__`` and ``__exit__``.
+    It queries the drones' clocks between ``__enter__`` and ``__exit__``.
     """
 
     def __init__(self, watcher: FleetWatcher) -> None:
-        """``watcher``: stays its owner's."""
+        """``watcher``: the caller closes it."""
         self._watcher = watcher
         self._lock = threading.Lock()
         self._known: dict[str, Known] = {}
         self._readings: dict[str, deque[ClockReading]] = {}
         self._due_s: dict[str, float] = {}
-        """When each is asked next."""
+        """Time of the next query to each drone."""
         self._waits_s: dict[str, float] = {}
-        """How long those wait that did not answer."""
+        """Interval of queries to drones that did not answer."""
         self._asking: set[str] = set()
         self._rows: tuple[float, dict[str, Row]] = -math.inf, {}
         self._history: dict[str, deque[list[float | None]]] = {}
@@ -75,16 +75,16 @@ class LiveFleet:
         return time.time() - time.monotonic() + time_s
 
     def drones(self) -> tuple[Watched, ...]:
-        """All that were ever heard."""
+        """All drones that were ever heard."""
         return self._watcher.drones()
 
     def known(self) -> Mapping[str, Known]:
-        """What each drone has answered to queries, by its key."""
+        """Replies to queries, by the drone's key."""
         with self._lock:
             return dict(self._known)
 
     def rows(self, time_s: float) -> dict[str, Row]:
-        """What is known of each drone that was ever heard, by its key, the worst first."""
+        """The row of each drone that was ever heard, by its key, the worst first."""
         made_s, rows = self._rows
         if not 0.0 <= time_s - made_s < ROWS_S:
             rows = drone_rows(self.drones(), self.known(), time_s)
@@ -92,7 +92,7 @@ class LiveFleet:
         return rows
 
     def notes(self) -> list[str]:
-        """Warnings of messages that no drone sends."""
+        """Warnings about messages that no drone sends."""
         malformed, forgotten = self._watcher.malformed, self._watcher.forgotten
         notes = []
         if malformed > MANY:
@@ -102,26 +102,26 @@ class LiveFleet:
         return [f"{note}; see who else reaches these endpoints" for note in notes]
 
     def events(self) -> list[Event]:
-        """All that are remembered, the newest last."""
+        """All remembered events, the newest last."""
         return [(event.time_s, f"{event.fleet}/{event.drone}", event.sentence) for event in self._watcher.events()]
 
     def history(self) -> Mapping[str, list[list[float | None]]]:
-        """Of the last five minutes, by key: rows of `HISTORY_COLUMNS` in order of time."""
+        """The last five minutes by key: rows of `HISTORY_COLUMNS` in order of time."""
         with self._lock:
             return {key: list(rows) for key, rows in self._history.items()}
 
     def ask(self, drone: str, command: str, order: Mapping[str, object] | None, operator: str) -> AnswerMessage:
-        """Asks the drone itself, which decides. Waits; called on a thread of its own, as `image` is."""
+        """Sends a command to the drone, which decides. Waits: call it, and `image`, on a separate thread."""
         answer = self._watcher.ask(drone, command, operator, order)
         return answer or AnswerMessage(accepted=False, sentence="did not answer, or this computer may not command it")
 
     def image(self, drone: str, camera: str) -> bytes | None:
-        """A JPEG of what a camera sees: asks the drone itself."""
+        """A JPEG of a camera's image, from the drone."""
         there = any(one.alive and f"{one.fleet}/{one.drone}" == drone for one in self._watcher.drones())
         return self._watcher.queries.image(drone, camera) if there and is_name(camera) else None
 
     def _run(self) -> None:
-        """Keeps the history, and asks each drone that is alive as soon as it appears, then now and again."""
+        """Keeps the history, and queries each drone when it appears and then regularly."""
         while not self._over.wait(LOOK_EVERY_S):
             now_s, drones = time.monotonic(), self._watcher.drones()
             self._keep(now_s)
@@ -144,7 +144,7 @@ class LiveFleet:
                 kept.append(history_row(row, now_s))
 
     def _forget(self, key: str) -> None:
-        """When it comes back, its configuration may differ."""
+        """Deletes a drone's replies: when it comes back, its configuration may differ."""
         self._due_s.pop(key, None)
         self._waits_s.pop(key, None)
         with self._lock:
@@ -152,7 +152,7 @@ class LiveFleet:
             self._readings.pop(key, None)
 
     def _ask_one(self, key: str) -> None:
-        """On a thread of its own."""
+        """Queries one drone, on a separate thread."""
         answered = False
         try:
             answered = self._learn(key)
@@ -163,7 +163,7 @@ class LiveFleet:
             self._asking.discard(key)
 
     def _learn(self, key: str) -> bool:
-        """Whether it answered."""
+        """Takes a drone's replies. Returns whether it answered."""
         with self._lock:
             about = self._known.get(key, Known()).about
         about = about or self._watcher.queries.about(key)
@@ -179,5 +179,5 @@ class LiveFleet:
 
 
 def _rounded(count: int) -> int:
-    """To one digit, so that a note seldom changes."""
+    """A number rounded to one digit, so that a note seldom changes."""
     return int(float(f"{count:.0e}"))

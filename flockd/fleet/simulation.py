@@ -1,8 +1,8 @@
-"""Controls of a live simulation: their content, and the way to the simulator.
+"""Controls of a live simulation: their messages, and the link to the simulator.
 
-They are no orders to drones. They go under a key of the simulator's own, `flockd-sim/v1/<fleet>/simulator`, where
-nothing that flies replies: a query for `.../state` is answered with a `SimulationMessage`, one for `.../ask/<control>`,
-which carries an `AskMessage` as a drone's does, with an `AnswerMessage`.
+They are no orders to drones: they have a key of the simulator, `flockd-sim/v1/<fleet>/simulator`. The reply to a query
+for `.../state` is a `SimulationMessage`. A query for `.../ask/<control>` carries an `AskMessage`, like a drone's; the
+reply is an `AnswerMessage`.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ class SimulationMessage(TypedDict):
     """The state of a simulation."""
 
     identity: str
-    """Of all of its drones, in their liveliness tokens."""
+    """Identity in the liveliness tokens of all of its drones."""
     by_sight: bool
-    """Its drones fly on what they see."""
+    """Whether its drones fly by sight."""
     flight: int
     """Counts up at each restart."""
     time_s: float
     """Of the flight."""
     paused: bool
     speed: float
-    """How fast simulated time is to pass."""
+    """Wanted speed of simulated time."""
     speed_reached: float | None
-    """How fast it has passed in the last seconds; null while it does not, or is not known yet."""
+    """Its speed in the last seconds; null: it stands still, or the speed is not known yet."""
     gust_m_s: float
     cameras_off: dict[str, list[str]]
     """By drone."""
@@ -48,7 +48,7 @@ class SimulationMessage(TypedDict):
 
 
 def key_of(fleet: str) -> str:
-    """Under which the simulator of a fleet is found."""
+    """Key of a fleet's simulator."""
     return f"{PREFIX}/{fleet}/{NAME}"
 
 
@@ -87,14 +87,14 @@ def _text(given: Mapping[str, object], key: str) -> str:
 
 
 class SimulationLink:
-    """To the simulator of one fleet. Asks it how it is doing, on a thread, between ``__enter__`` and ``__exit__``.
+    """The link to a fleet's simulator. Queries its state on a thread between ``__enter__`` and ``__exit__``.
 
-    Where a drone is heard that is not this simulator's, there is nothing to control any more: a page that shows real
-    drones has no controls of a simulation.
+    If a drone is heard that is not this simulator's, all controls are refused: a page with real drones has no controls
+    of a simulation.
     """
 
     def __init__(self, fleet: str, watcher: FleetWatcher) -> None:
-        """``watcher``: stays its owner's."""
+        """``watcher``: the caller closes it."""
         self._key, self._watcher = f"{fleet}/{NAME}", watcher
         self._queries: DroneQueries = watcher.queries_under(PREFIX)
         self._newest: SimulationMessage | None = None
@@ -111,12 +111,12 @@ class SimulationLink:
         self._thread.join()
 
     def state(self) -> SimulationMessage | None:
-        """The newest; None where no simulator answers, or where drones are heard that are not its own."""
+        """The newest state; None: no simulator replies, or other drones are heard."""
         newest = self._newest
         return None if newest is None or self._strangers(newest) else newest
 
     def ask(self, control: str, value: Mapping[str, object], operator: str) -> AnswerMessage:
-        """The simulator's answer to a control. Waits; for a thread of its own."""
+        """The simulator's answer to a control. Waits: call it on a separate thread."""
         newest = self._newest
         if newest is None:
             return AnswerMessage(accepted=False, sentence="no simulator answers")
@@ -132,7 +132,7 @@ class SimulationLink:
         return answer or AnswerMessage(accepted=False, sentence="the simulator did not answer")
 
     def _strangers(self, newest: SimulationMessage) -> list[str]:
-        """Drones that have ever been heard with another identity than the simulator's, or without any."""
+        """Drones that were heard with another identity than the simulator's, or without one."""
         own = frozenset({newest["identity"]})
         for one in self._watcher.drones():
             if one.identities - own or not one.announced:

@@ -1,4 +1,4 @@
-"""Watches a fleet: for the commands of people. Nothing that flies imports this."""
+"""Watches a fleet's telemetry, for people. Code that flies does not import it."""
 
 from __future__ import annotations
 
@@ -19,36 +19,36 @@ from flockd.onboard.telemetry.topics import PREFIX, TOPICS, AnswerMessage, check
 from flockd.onboard.telemetry.zenoh_session import SessionOwner, close_session, open_session
 
 MAX_BYTES = 1 << 15
-"""The largest message: that of a drone which sees a hundred others."""
+"""Largest message: that of a drone with a hundred neighbours."""
 MAX_DRONES = 200
-"""The most drones that are remembered, in case a sender invents names."""
+"""Largest number of remembered drones, in case a sender invents names."""
 FORGOTTEN_AT_ONCE = 20
 MAX_EVENTS, MAX_EVENTS_OF_ONE = 500, 100
-"""The newest events that are remembered: of all drones, and of one."""
+"""Numbers of remembered events: of all drones, and of one."""
 MAX_LINK_BYTES = 1 << 20
-"""Of one message on its way, before anything of flockd's sees it."""
+"""zenoh's limit for one message."""
 _PERIOD_SHARE = 0.2
 """Weight of the newest period in the mean."""
 _SLOWEST = 10.0
-"""The smallest speed factor that a daemon's configuration allows is 0.1."""
+"""Largest ratio of the watcher's time to a drone's: simulated time may be slow."""
 
 
 @dataclass(frozen=True)
 class Heard:
-    """The newest message of one topic, and when it came on the watcher's clock."""
+    """The newest message of one topic, and its arrival on the watcher's clock."""
 
     time_s: float
     message: Mapping[str, Any]
     slowness: float = 1.0
-    """Seconds of the watcher's clock in one of the drone's: a simulated drone's time may pass slowly."""
+    """Seconds of the watcher's clock in a second of the drone's: a simulated drone's time may pass slowly."""
     period_s: float | None = None
-    """Between new messages, by the watcher's clock, smoothed; None before the second."""
+    """Smoothed time between new messages, by the watcher's clock; None before the second message."""
     new_s: float | None = None
-    """When the newest message came that was not a repetition."""
+    """Arrival of the newest message that was not a repetition."""
 
 
 def _heard(before: Heard | None, now_s: float, message: Mapping[str, Any]) -> Heard:
-    """With how slowly the drone's time passed since its message before."""
+    """A message, with the speed of the drone's time since its last message."""
     if before is None:
         return Heard(now_s, message, _SLOWEST, new_s=now_s)  # not known yet
     own_s = message.get("time_s", 0.0) - before.message.get("time_s", 0.0)
@@ -68,27 +68,27 @@ def _period_s(before: Heard, now_s: float) -> float | None:
 
 @dataclass(frozen=True)
 class Watched:
-    """What is known of one drone."""
+    """State of one drone."""
 
     fleet: str
     drone: str
     alive: bool = False
-    """Its liveliness token is there: its process runs and can be reached."""
+    """Whether its liveliness token exists: its process runs and can be reached."""
     topics: Mapping[str, Heard] = field(default_factory=dict)
     malformed: Mapping[str, str] = field(default_factory=dict)
-    """What is wrong with the newest message of a topic, by topic, until a well-formed one comes."""
+    """Fault of the newest message of each topic, until a valid one comes."""
     seen: bool = False
-    """Something of it was well formed, or its token was there: it is a drone."""
+    """Whether a valid message or a token of it was received."""
     identities: frozenset[str] = frozenset()
-    """Of the tokens that are there: several where several drones have this one name. Empty text: of a drone of an
-    earlier version."""
+    """Identities of the current tokens: several if several drones have this name. Empty text: a drone of an earlier
+    version."""
     announced: bool = False
-    """Its token is there, or was."""
+    """Whether its token exists or existed."""
     messages: int = 0
-    """That were well formed."""
+    """Number of valid messages."""
 
     def message(self, topic: str, now_s: float) -> Mapping[str, Any] | None:
-        """The newest of a topic; None where there is none, or one too old to say anything of now."""
+        """The newest message of a topic; None: there is none, or it is outdated."""
         heard, stale_s = self.topics.get(topic), TOPICS[topic].stale_after_s
         if heard is None or (stale_s is not None and now_s - heard.time_s > stale_s * heard.slowness):
             return None
@@ -97,7 +97,7 @@ class Watched:
 
 @dataclass(frozen=True)
 class HeardEvent:
-    """Something that happened once to one drone, and when it was heard on the watcher's clock."""
+    """An event of one drone, and its arrival on the watcher's clock."""
 
     time_s: float
     fleet: str
@@ -106,7 +106,7 @@ class HeardEvent:
 
 
 class FleetWatcher(SessionOwner):
-    """Hears all that the drones of a fleet publish. Raises UnavailableError for an endpoint that cannot be used."""
+    """Receives all messages of a fleet's drones. Raises UnavailableError for an unusable endpoint."""
 
     def __init__(
         self,
@@ -117,14 +117,14 @@ class FleetWatcher(SessionOwner):
         settings: Path | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """``fleet``: None for every fleet that is heard."""
+        """``fleet``: None: all fleets."""
         self._clock = clock
         self._lock = threading.Lock()
         self._drones: dict[tuple[str, str], Watched] = {}
         self.malformed = 0
-        """Messages that are none, and those of drones that cannot be."""
+        """Number of malformed messages, and of those of impossible drones."""
         self.forgotten = 0
-        """Names that made room for others."""
+        """Number of names that were deleted to make room for others."""
         self._events: deque[HeardEvent] = deque(maxlen=MAX_EVENTS)
         connected = partial(open_session, settings=settings, max_message_bytes=MAX_LINK_BYTES)
         self._session = connected("telemetry", listen, connect)
@@ -139,7 +139,7 @@ class FleetWatcher(SessionOwner):
         self._tokens = tokens.declare_subscriber(f"{drones}/alive/**", self._take_token, history=True)
 
     def queries_under(self, prefix: str) -> DroneQueries:
-        """To what replies as drones do, under other keys."""
+        """Queries to programs that reply like drones, under other keys."""
         return DroneQueries(self._session, self._orders, prefix)
 
     def close(self) -> None:
@@ -151,9 +151,9 @@ class FleetWatcher(SessionOwner):
     def ask(
         self, drone: str, command: str, operator: str, order: Mapping[str, object] | None = None
     ) -> AnswerMessage | None:
-        """A drone's answer to an operator's command, by its key `fleet/drone`; None where none comes.
+        """A drone's answer to an operator's command, by its key `fleet/drone`; None: no answer.
 
-        Refused here where it is not clear which drone would get it.
+        The command is refused here if several drones have the name.
         """
         fleet, _, name = drone.partition("/")
         with self._lock:
@@ -166,21 +166,21 @@ class FleetWatcher(SessionOwner):
         return self.queries.ask(drone, identity, command, operator, order)
 
     def drones(self) -> tuple[Watched, ...]:
-        """All that were ever heard of."""
+        """All drones that were ever heard."""
         with self._lock:
             return tuple(drone for drone in self._drones.values() if drone.seen)
 
     def events(self) -> tuple[HeardEvent, ...]:
-        """The newest, in the order in which they came."""
+        """The newest events, in the order of arrival."""
         with self._lock:
             return tuple(self._events)
 
     def reached(self) -> int:
-        """How many peers and routers it is connected to."""
+        """Number of connected peers and routers."""
         return len(self._session.info.peers_zid()) + len(self._session.info.routers_zid())
 
     def _take_message(self, sample: zenoh.Sample) -> None:
-        """On a thread of zenoh's. What is malformed is kept as such, for a drone that is known otherwise."""
+        """Called on a thread of zenoh's. For a known drone, a malformed message is kept as a fault."""
         fleet, drone, topic = str(sample.key_expr).split("/")[2:5]
         message, wrong = _parsed(sample.payload, topic)
         with self._lock:
@@ -218,7 +218,7 @@ class FleetWatcher(SessionOwner):
             )
 
     def _watched(self, fleet: str, drone: str) -> Watched | None:
-        """What is known of a drone so far; None for one that cannot be."""
+        """The state of a drone; None: its name is impossible."""
         known = self._drones.get((fleet, drone))
         if known is not None:
             return known
@@ -241,7 +241,7 @@ class FleetWatcher(SessionOwner):
 
 
 def ambiguity(drone: Watched) -> str | None:
-    """What is wrong where several drones have one name; None for a unique name."""
+    """A sentence if several drones have one name; None: the name is unique."""
     if len(drone.identities) < 2:
         return None
     identities = ", ".join(sorted(identity or "of an earlier version" for identity in drone.identities))
@@ -252,13 +252,13 @@ def ambiguity(drone: Watched) -> str | None:
 
 
 def _standing(drone: Watched) -> tuple[bool, bool, int, float]:
-    """The drone with the least is forgotten first."""
+    """Sort key: the drone with the least is deleted first."""
     last_s = max((heard.time_s for heard in drone.topics.values()), default=0.0)
     return drone.alive, drone.announced, drone.messages, last_s
 
 
 def _parsed(payload: zenoh.ZBytes, topic: str) -> tuple[dict[str, Any], str | None]:
-    """A message, and what is wrong with it."""
+    """A message, or its fault."""
     raw = payload.to_bytes()
     if len(raw) > MAX_BYTES:
         return {}, f"it is longer than {MAX_BYTES >> 10} KiB"

@@ -1,7 +1,7 @@
-"""A detector that people train, as Ultralytics and YOLOX export it, made into one for `perception.detector`.
+"""Converts a detector that Ultralytics or YOLOX exported to a network for `perception.detector`.
 
-Their outputs differ; nodes at the end of the graph make flockd's boxes of them, as of `models/detector.yaml`, so that
-nothing that flies has to know them.
+Their outputs differ. Nodes at the end of the graph convert them to flockd's boxes, as of `models/detector.yaml`, so
+that no code that flies depends on them.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from flockd.flight.inference.session import cannot_run
 from flockd.ground.manifest_writer import write_manifest, write_unchecked
 
 STRIDES = (8, 16, 32, 64)
-"""Of the grids of cells, pixels; most networks have the first three."""
+"""Strides of the grids of cells, pixels; most networks have the first three."""
 COLUMNS = ("centre_right_px", "centre_down_px", "width_px", "height_px", "drone_probability")
 _EXPORT = "export it again with a fixed size, as with imgsz=640 and without dynamic"
 _TYPES: dict[int, str] = {TensorProto.FLOAT: "float32", TensorProto.FLOAT16: "float16"}
@@ -45,11 +45,11 @@ class Imported:
     manifest: Path
     kind: str
     drone: str
-    """The name or number of the drones' class."""
+    """Name or number of the class of drones."""
     classes: int | None
-    """How many there are; None: the file does not say."""
+    """Number of classes; None: the file does not say."""
     terms: str
-    """What the file itself says of the AGPL, under which Ultralytics gives its networks; else empty."""
+    """The file's own note about the AGPL, Ultralytics' licence for its networks; else empty."""
 
 
 def import_detector(file: Path, drone: str, licence: str | None, folder: Path, *, overwrite: bool = False) -> Imported:
@@ -99,7 +99,7 @@ def import_detector(file: Path, drone: str, licence: str | None, folder: Path, *
 
 @dataclass(frozen=True)
 class _Kind:
-    """How a network's output holds its boxes."""
+    """Layout of the boxes in a network's output."""
 
     name: str
     image: onnx.ValueInfoProto
@@ -109,12 +109,12 @@ class _Kind:
     columns: int
     """Numbers of a box."""
     classes: int | None
-    """None: not to be told from the shape."""
+    """None: the shape does not tell."""
     transposed: bool = False
-    """Whether a box is a column of the output, not a row."""
+    """Whether a box is a column of the output, instead of a row."""
     objectness: bool = False
     strides: tuple[int, ...] = ()
-    """Of the grids in whose cells boxes are still to be decoded."""
+    """Strides of the grids in whose cells boxes are still to be decoded."""
     corners: bool = False
     """Whether a box has its corners, one score and the number of its class, without overlaps (end to end)."""
     input: dict[str, Any] = field(default_factory=lambda: {"white": 1.0})
@@ -137,7 +137,7 @@ def _shape(tensor: onnx.ValueInfoProto) -> list[int | str]:
 
 
 def _kind_of(file: Path, model: onnx.ModelProto) -> _Kind:
-    """By the shapes of input and output. Raises ModelError."""
+    """The kind of a network, by the shapes of its input and output. Raises ModelError."""
     weights = {one.name for one in model.graph.initializer}
     images = [one for one in model.graph.input if one.name not in weights]
     shape = _shape(images[0]) if images else []
@@ -175,7 +175,7 @@ def _kind_of(file: Path, model: onnx.ModelProto) -> _Kind:
 
 
 def _class_names(said: dict[str, str]) -> dict[int, str]:
-    """As Ultralytics writes them beside the network: {0: 'drone'}, or ['drone']."""
+    """The classes as Ultralytics writes them into the file: {0: 'drone'}, or ['drone']."""
     try:
         names = ast.literal_eval(said.get("names", "{}"))
     except (ValueError, SyntaxError):
@@ -198,7 +198,7 @@ def _class_number(file: Path, drone: str, names: dict[int, str], classes: int | 
 
 
 def _append_boxes(model: onnx.ModelProto, kind: _Kind, number: int) -> None:
-    """Replaces the outputs by `boxes` (n, 5) of `COLUMNS`, of the class of this number."""
+    """Replaces the outputs by `boxes` (n, 5) of `COLUMNS`, for the class of this number."""
     graph, count = model.graph, iter(range(1000))
 
     def constant(value: NDArray[Any]) -> str:
@@ -239,7 +239,7 @@ def _append_boxes(model: onnx.ModelProto, kind: _Kind, number: int) -> None:
 
 
 def _grid(size: tuple[int, int], strides: Sequence[int]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Of YOLOX's cells in their order column and row (n, 2), and stride (n, 1) (Z. Ge et al., "YOLOX", 2021)."""
+    """Column and row (n, 2) and stride (n, 1) of YOLOX's cells, in their order (Z. Ge et al., "YOLOX", 2021)."""
     cells, of = [], []
     for stride in strides:
         right, down = np.meshgrid(np.arange(size[0] // stride), np.arange(size[1] // stride))
@@ -249,7 +249,7 @@ def _grid(size: tuple[int, int], strides: Sequence[int]) -> tuple[NDArray[np.flo
 
 
 def _manifest(file: Path, kind: _Kind, name: str, drone: str, licence: str, said: dict[str, str]) -> dict[str, Any]:
-    """Without hash and golden output. The thresholds are those of flockd's own detector."""
+    """The manifest without hash and golden output, with the thresholds of flockd's own detector."""
     ours, _ = load_manifest(data_path("models") / "detector.yaml")
     dtype = _TYPES[kind.image.type.tensor_type.elem_type]
     width, height = kind.size
@@ -283,7 +283,7 @@ def _manifest(file: Path, kind: _Kind, name: str, drone: str, licence: str, said
 
 
 def _checked(file: Path, manifest: dict[str, Any], there: Path) -> dict[str, NDArray[Any]]:
-    """The output for the golden picture. Raises ModelError where it cannot be what the kind of network gives."""
+    """The output for the golden image. Raises ModelError if it is impossible for this kind of network."""
     opened = read_manifest(write_unchecked(manifest, there))
     runtime = open_runtime(opened, threads=1, provider="cpu", folder=None)
     try:

@@ -1,4 +1,4 @@
-"""The card of a flight day from a drone's own configuration: limits, heights, what each fault does, who does what."""
+"""The card of a flight day from a drone's configuration: limits, reactions to faults, roles of people, a checklist."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Writes the manifest that belongs to a model file."""
+"""Writes the manifest of a model file."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def write_unchecked(document: dict[str, Any], file: Path) -> Path:
 
 
 class WithoutAliases(yaml.SafeDumper):
-    """Lists that two keys share are written twice: a manifest may have no anchors."""
+    """Writes a list that two keys share twice, because manifests may not have anchors."""
 
     def ignore_aliases(self, data: Any) -> bool:
         """Whatever it is."""

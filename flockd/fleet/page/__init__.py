@@ -1,1 +1,1 @@
-"""The fleet page: the flock in a browser, live from its telemetry or from recordings, and commands to it."""
+"""The fleet page: shows a fleet in a browser from its telemetry, and sends commands."""

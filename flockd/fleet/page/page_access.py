@@ -1,4 +1,4 @@
-"""Who may open the page and who may command from it: a key in its address, then a session with a token."""
+"""Access to the page and its commands: a key in the address opens a session, whose token permits commands."""
 
 from __future__ import annotations
 
@@ -29,34 +29,33 @@ HEADERS = {
     "Referrer-Policy": "no-referrer",
     "Cache-Control": "no-store",
 }
-"""Headers of every reply: nothing comes from elsewhere, and nobody else may embed or read it."""
+"""Headers of every reply: the page loads no resources from elsewhere, and other sites cannot embed or read it."""
 _KEY = re.compile(r"[A-Za-z0-9_-]{16,200}")
 _KEY_BYTES = 1024
 
 
 class PageAccess:
-    """Sessions of one key. The key opens the page; a session's token, which only its page knows, commands.
+    """Sessions of one key. The key opens the page; commands need the session's token, which only its page knows.
 
-    Sessions and tokens are derived from the key: a server that is started again with the same key knows the earlier
-    sessions.
+    Sessions and tokens are derived from the key, so they stay valid if the server is restarted with the same key.
     """
 
     def __init__(self, key: str | None = None) -> None:
-        """``key``: None for one of this start alone."""
+        """``key``: None: a new one for this start."""
         self.key = key or _new_key()
-        """Part of the address that the server prints."""
+        """The key, a part of the address that the server prints."""
         self.cookie = f"flockd_{self._code('cookie', '')[:8]}"
-        """Browsers do not tell ports apart: another server has another name."""
+        """Name of the cookie, different for each server, because cookies do not depend on the port."""
 
     def open_session(self, key: str) -> str | None:
-        """A new session's name for a cookie; None for a wrong key."""
+        """A new session for a cookie; None: the key is wrong."""
         if not _same(key, self.key):
             return None
         name = secrets.token_hex(16)
         return f"{name}.{self._code('session', name)}"
 
     def token_of(self, session: str | None) -> str | None:
-        """The token of a session; None where there is no such session."""
+        """The token of a session; None: there is no such session."""
         name, _, code = (session or "").partition(".")
         return self._code("token", name) if _same(code, self._code("session", name)) else None
 
@@ -71,9 +70,9 @@ class PageAccess:
 
 
 def lasting_key(path: Path) -> str:
-    """The key in a file that its owner alone may read, which is made where there is none.
+    """The key in a file that only its owner may read; makes the file if it does not exist.
 
-    Raises UnavailableError for one that cannot be read, that others may read, or that holds no key.
+    Raises UnavailableError if the file cannot be read, others may read it, or it has no key.
     """
     key = _new_key()
     try:
@@ -112,9 +111,9 @@ def _same(one: str, other: str) -> bool:
 
 
 def is_own_host(host: str) -> bool:
-    """Whether a request's Host is this computer by address or by its own name.
+    """Whether a request's Host is this computer's address or name.
 
-    A page of a stranger whose name suddenly leads to this computer (DNS rebinding) sends its own name.
+    After DNS rebinding, a foreign page whose name leads to this computer still sends its own name.
     """
     try:
         name = urlsplit(f"//{host}").hostname or ""
@@ -131,14 +130,14 @@ def is_own_host(host: str) -> bool:
 
 
 def is_own_origin(headers: Mapping[str, str]) -> bool:
-    """Whether the page that sends a request is this server's own."""
+    """Whether a request comes from a page of this server."""
     return "Origin" in headers and headers["Origin"] == f"http://{headers.get('Host', '')}"
 
 
 MAX_STRANGERS = 64
-"""Connections over which no page with the key has asked for anything; a further one closes the oldest."""
+"""Largest number of connections without a valid request; a further one closes the oldest."""
 STRANGER_S = 10.0
-"""Time for a whole request; a browser needs a fraction of a second."""
+"""Time limit of a request; a browser needs a fraction of a second."""
 _TIDY_EVERY_S = 1.0
 
 
@@ -146,7 +145,7 @@ class PageConnections:
     """A protocol factory for the event loop, around aiohttp's own."""
 
     def __init__(self, server: web.Server, trusted: set[object], clock: Callable[[], float] = time.monotonic) -> None:
-        """``trusted``: connections that have shown the key; those that have ended are taken out of it here."""
+        """``trusted``: connections with a valid request; closed ones are removed here."""
         self._server, self._trusted, self._clock = server, trusted, clock
         self._since_s: dict[web.RequestHandler, float] = {}
 
@@ -156,7 +155,7 @@ class PageConnections:
         return self._server()
 
     async def run(self) -> None:
-        """Closes those that ask for nothing, until cancelled."""
+        """Closes connections without a request in time, until cancelled."""
         while True:
             await asyncio.sleep(_TIDY_EVERY_S)
             self._tidy(MAX_STRANGERS)

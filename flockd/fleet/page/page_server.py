@@ -27,20 +27,20 @@ from flockd.onboard.telemetry.topics import AnswerMessage
 PUSH_EVERY_S = 0.25
 MAX_REQUEST_BYTES = 1 << 14
 COMMANDS = ("hold", "land", "resume", "goto", "velocity")
-"""What the page may ask of drones."""
+"""Commands of the page."""
 _FOLDER = Path(__file__).parent
 _TYPES = {".js": "text/javascript", ".css": "text/css"}
 MAX_PAGES = 32
-"""Pages that may be open at once."""
+"""Largest number of open pages."""
 HELLO_S = 5.0
 """Time for a page to send its token."""
 _ORDER_THREADS = 64
 _TOKEN = "@TOKEN@"
-"""In the page, for the session's."""
+"""Placeholder in the page for the session's token."""
 
 
 class PageServer:
-    """The application of one fleet. `application` gives what aiohttp serves."""
+    """Serves the page of one fleet; `application` is for aiohttp."""
 
     def __init__(
         self,
@@ -54,23 +54,23 @@ class PageServer:
         """For one event loop.
 
         Args:
-            source: of the fleet.
-            access: who may see it.
-            may_command: whether this page passes commands on at all; each drone decides too.
-            operator: who gives commands here, as drones are told; the page and where it is open are added.
-            simulation: what the page controls beside the drones; None, as with real ones: it has no such controls.
+            source: the fleet's state.
+            access: the access rules.
+            may_command: whether this page sends commands; each drone decides too.
+            operator: the operator's name for the drones; number and address of the page are added.
+            simulation: controls of a simulation; None: real drones.
         """
         self._source, self._access, self._may_command, self._operator = source, access, may_command, operator
         self._order_threads = ThreadPoolExecutor(_ORDER_THREADS, "orders of the fleet page")
-        """Nothing else waits on them."""
+        """Threads for orders only."""
         self._pictures = PagePictures(source.image, EVERY_S if simulation is None else OF_SIMULATION_S)
         self._pages, self._simulation = 0, simulation
         self.trusted: set[object] = set()
-        """Connections over which a page with the key has asked for something."""
+        """Connections with a valid request."""
         self._plotly: bytes | None = None
 
     def application(self) -> web.Application:
-        """With the access rules around every route."""
+        """The application, with the access rules around every route."""
         application = web.Application(middlewares=[self._guarded], client_max_size=MAX_REQUEST_BYTES)
         application.add_routes(
             [
@@ -90,7 +90,7 @@ class PageServer:
     async def _guarded(
         self, request: web.Request, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]
     ) -> web.StreamResponse:
-        """Refuses strangers; the headers of `HEADERS` go with every reply."""
+        """Refuses requests without access, and adds `HEADERS` to every reply."""
         try:
             response = await self._refusal(request) or await handler(request)
         except web.HTTPException as error:
@@ -100,7 +100,7 @@ class PageServer:
         return response
 
     async def _refusal(self, request: web.Request) -> web.Response | None:
-        """None for a request of a session of this server, or one that may open one."""
+        """Why a request is refused; None: it has a session of this server, or may open one."""
         if not is_own_host(request.headers.get("Host", "")):
             return _text(403, "the page is served under this computer's address or name only")
         if request.path == "/" and "key" in request.query:
@@ -131,7 +131,7 @@ class PageServer:
         return web.Response(text=path.read_text(encoding="utf-8"), content_type=_TYPES[path.suffix])
 
     async def _plotting_library(self, request: web.Request) -> web.Response:
-        """As its Python package has it, packed once."""
+        """The library from its Python package, compressed once."""
         if self._plotly is None:
             path = files("plotly") / "package_data" / "plotly.min.js"
             self._plotly = await asyncio.to_thread(lambda: gzip.compress(path.read_bytes(), 4))
@@ -149,7 +149,7 @@ class PageServer:
         return web.Response(body=image, content_type="image/jpeg")
 
     async def _ask(self, request: web.Request) -> web.Response:
-        """A command to drones, one answer a drone. Only from this server's own page."""
+        """Sends a command to drones; one answer for each. Only for this server's own page."""
         refusal = self._refusal_to_command(request)
         if refusal is not None:
             return refusal
@@ -171,7 +171,7 @@ class PageServer:
         return web.json_response(told, dumps=_json)
 
     async def _simulate(self, request: web.Request) -> web.Response:
-        """A control of the simulation. Only from this server's own page, and only where there is a simulation."""
+        """Sends a control to the simulation. Only for this server's own page."""
         refusal = self._refusal_to_command(request)
         if refusal is not None:
             return refusal
@@ -188,7 +188,7 @@ class PageServer:
         return web.json_response(answer, dumps=_json)
 
     def _refusal_to_command(self, request: web.Request) -> web.Response | None:
-        """None for a command from this server's own page, where it may command."""
+        """Why a command is refused; None: it comes from this server's own page, which may command."""
         session = request.cookies.get(self._access.cookie)
         if not is_own_origin(request.headers) or not self._access.is_token(
             session, request.headers.get("X-Flockd-Token")
@@ -199,7 +199,7 @@ class PageServer:
         return None
 
     async def _live(self, request: web.Request) -> web.StreamResponse:
-        """Rows as they change. The page's first message has to carry its session's token."""
+        """Sends changes of rows. The page's first message has to contain its session's token."""
         if not is_own_origin(request.headers):
             return _text(403, "live data goes to this server's own page only")
         if self._pages >= MAX_PAGES:
@@ -215,7 +215,7 @@ class PageServer:
         return socket
 
     async def _feed(self, request: web.Request, socket: web.WebSocketResponse) -> None:
-        """Until the page is closed."""
+        """Runs until the page is closed."""
         try:
             first = await socket.receive(timeout=HELLO_S)
             hello = _object(first.data) if first.type == WSMsgType.TEXT else {}
@@ -236,20 +236,20 @@ class PageServer:
 
 
 class _Feed:
-    """What one page is sent: each time only what has changed for it."""
+    """Sends one page the changes since its last message."""
 
     def __init__(self, source: LiveFleet, socket: web.WebSocketResponse, simulation: SimulationLink | None) -> None:
         self._source, self._socket, self._simulation = source, socket, simulation
         self._sent: dict[str, Row] = {}
         self._event: Event | None = None
-        """The newest that was sent."""
+        """State of the last message."""
 
     async def greet(self, *, may_command: bool) -> None:
-        """What the page has to know of the server."""
+        """The first message: the server's settings."""
         await self._send({"kind": "hello", "may_command": may_command})
 
     async def push(self) -> None:
-        """Sends what is new until the page is closed."""
+        """Sends changes until the page is closed."""
         reading = asyncio.create_task(self._wait_for_end())
         try:
             while not reading.done():
@@ -291,7 +291,7 @@ class _Feed:
 
 
 def _asked(body: Mapping[str, Any]) -> tuple[list[str], str, dict[str, object] | None]:
-    """Drones, command and order of a request. Raises ValueError for what is none."""
+    """Drones, command and order of a request. Raises ValueError if it is invalid."""
     if not body:
         raise ValueError("a command is a JSON object")
     drones, command, order = body.get("drones"), body.get("command"), body.get("order")
@@ -308,7 +308,7 @@ def _asked(body: Mapping[str, Any]) -> tuple[list[str], str, dict[str, object] |
 
 
 def _object(text: str | bytes) -> dict[str, Any]:
-    """The JSON object of a text in UTF-8; an empty one for what is none."""
+    """The JSON object in a text; empty if there is none."""
     try:
         value = json.loads(text)
     except (ValueError, RecursionError):
@@ -321,7 +321,7 @@ def _text(status: int, sentence: str) -> web.Response:
 
 
 def _json(value: object) -> str:
-    """With null for numbers that JSON cannot hold, so that one drone's faulty message does not hide the others."""
+    """JSON with null for numbers that are not finite, so that one drone's faulty message does not hide the others."""
     try:
         return json.dumps(value, separators=(",", ":"), allow_nan=False)
     except ValueError:
@@ -337,13 +337,13 @@ def _finite(value: object) -> object:
 
 
 EVERY_S, OF_SIMULATION_S = 1.0, 0.4
-"""Shortest time between two pictures of a camera: over a radio link, and of a simulation on this computer."""
+"""Shortest time between two pictures of a camera: over a radio link, and for a simulation on this computer."""
 SHOWN_S = 5.0
-"""Age up to which a picture is shown while the next one is on its way."""
+"""Largest age of a picture that is shown while the next one is fetched."""
 WAIT_S = 0.25
-"""How long a request waits for a picture; a later picture is there for the next request."""
+"""Time for which a request waits for a picture; a later picture is kept for the next request."""
 SILENT_S = 5.0
-"""A camera that gave no picture is asked again after this time."""
+"""Time after which a camera that gave no picture is queried again."""
 _THREADS, _THREADS_A_DRONE = 16, 4
 _MOST_KEPT = 500
 
@@ -352,9 +352,9 @@ Key = tuple[str, str]
 
 
 class PagePictures:
-    """Pictures for all pages: each camera is asked seldom, and no request waits for a drone for long.
+    """Pictures for all pages: each camera is queried seldom, and no request waits for a drone for long.
 
-    On the event loop; what waits for drones has threads of its own, of which one drone has a few.
+    Call it on the event loop; queries wait on threads, a few for each drone.
     """
 
     def __init__(
@@ -363,14 +363,15 @@ class PagePictures:
         every_s: float = EVERY_S,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """``fetch``: of a drone and a camera; waits. ``every_s``: shortest time between two of one camera."""
+        """``fetch``: gets a camera's picture from a drone, and waits. ``every_s``: shortest time between two of one
+        camera."""
         self._fetch, self._every_s, self._clock = fetch, every_s, clock
         self._threads = ThreadPoolExecutor(_THREADS, "pictures for the fleet page")
         self._asking: dict[Key, asyncio.Task[None]] = {}
         self._made: dict[Key, tuple[float, bytes | None]] = {}
 
     async def newest(self, drone: str, camera: str) -> bytes | None:
-        """A live one; None where there is none yet, or none any more."""
+        """The newest picture; None: there is no current one."""
         key, now_s = (drone, camera), self._clock()
         made_s, picture = self._made.get(key, (-SILENT_S, None))
         asking = self._asking.get(key)

@@ -1,1 +1,1 @@
-"""The fleet in ROS 2: its telemetry as standard messages, orders to it, and perception alone for other stacks."""
+"""ROS 2: a fleet's telemetry as standard messages, orders to it, and perception alone for other software."""

@@ -1,4 +1,4 @@
-"""A fleet's telemetry in ROS 2, and orders from there: a process beside the drones, for which no drone waits."""
+"""Publishes a fleet's telemetry in ROS 2, and takes orders from there. No drone waits for it."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from flockd.onboard.telemetry.topics import OrderMessage, StateMessage
 
 UPDATE_EVERY_S = 0.05
 STATE_EVERY_S = 1.0
-"""A drone's state is sent when it changes, and at this interval."""
+"""Interval at which a drone's state is sent; it is also sent when it changes."""
 PLAIN = ("hold", "land", "resume")
-"""Orders without a place: each is a service."""
+"""Orders without values; each is a service."""
 _LEVELS = {
     **dict.fromkeys(("normal", "ready", "idle"), trees.OK),
     **dict.fromkeys(("degraded", "hover", "silent"), trees.WARN),
@@ -41,11 +41,11 @@ _VALUES = (
 
 
 class FleetBridge:
-    """Publishes between ``__enter__`` and ``__exit__`` on a thread of its own."""
+    """Publishes between ``__enter__`` and ``__exit__``, on a separate thread."""
 
     def __init__(self, source: LiveFleet, node: RosNode, *, may_command: bool, operator: str) -> None:
-        """``source`` and ``node`` stay their owner's. ``may_command``: whether orders are passed on at all, and in the
-        name of which ``operator``."""
+        """The caller closes ``source`` and ``node``. ``may_command``: whether orders are passed on, in the name of
+        ``operator``."""
         self._source, self._node, self._may_command, self._operator = source, node, may_command, operator
         self._names = DroneNames()
         self.has_transforms = has_type(trees.TRANSFORMS)
@@ -66,7 +66,7 @@ class FleetBridge:
         self._thread.shutdown()
 
     def wait(self) -> None:
-        """Until it is closed. Raises what ended it before."""
+        """Waits until it is closed. Raises the error that ended it."""
         self._publishing.result()
 
     def _publish(self) -> None:
@@ -74,7 +74,7 @@ class FleetBridge:
             self.update()
 
     def update(self) -> None:
-        """Publishes what is new."""
+        """Publishes new messages."""
         now_s = self._source.now_s()
         rows = self._source.rows(now_s)
         for drone in self._source.drones():
@@ -90,7 +90,7 @@ class FleetBridge:
             self._publish_markers(name, row)
 
     def _publish_step(self, drone: Watched, name: str, row: Row, now_s: float) -> None:
-        """What each step of the drone's pilot told, once."""
+        """Publishes the messages of each step of the drone's pilot, once."""
         for topic in ("state", "neighbours", "obstacles"):
             heard, message = drone.topics.get(topic), drone.message(topic, now_s)
             if heard is None or message is None or self._sent.get((name, topic)) == heard.time_s:
@@ -141,7 +141,7 @@ class FleetBridge:
             self._node.publish(topic, trees.MARKERS, markers(time_ns, name, number, row), Delivery.STATE)
 
     def _serve(self, key: str, name: str) -> None:
-        """Its services, and the topics of orders that carry something."""
+        """Makes a drone's services, and the topics of orders with values."""
         for command in PLAIN:
             self._node.serve(f"/{name}/{command}", partial(self._ask, key, command, None))
         for topic, kind, command, parse in (
@@ -166,19 +166,19 @@ class FleetBridge:
         self._node.publish(f"/{name}/order_answer", trees.DIAGNOSTIC, told, Delivery.EVENT)
 
     def _ask(self, key: str, command: str, order: OrderMessage | None) -> tuple[bool, str]:
-        """Asks the drone itself, which decides."""
+        """Sends a command to the drone, which decides."""
         answer = self._source.ask(key, command, None if order is None else dict(order), self._operator)
         return answer["accepted"], answer["sentence"]
 
 
 class DroneNames:
-    """A namespace for each drone by its key `fleet/drone`; it keeps it, whoever else comes."""
+    """A fixed namespace for each drone, by its key `fleet/drone`."""
 
     def __init__(self) -> None:
         self._names: dict[str, str] = {}
 
     def of(self, key: str) -> str:
-        """Its own name, with its fleet's or a number where another drone has that already."""
+        """The drone's name; with its fleet's, or a number, if another drone already has the name."""
         if key not in self._names:
             short, whole = ros_name(key.partition("/")[2]), ros_name(key)
             taken = set(self._names.values())
@@ -188,7 +188,7 @@ class DroneNames:
 
 
 def _transforms(time_ns: int, names: Names, state: StateMessage, row: Row) -> Tree | None:
-    """map, odom, level and body, of a drone that knows its position."""
+    """Transforms of map, odom, level and body, for a drone that knows its position."""
     odometry = trees.state_odometry(time_ns, names, state)
     if odometry is None:
         return None

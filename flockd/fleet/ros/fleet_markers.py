@@ -1,4 +1,4 @@
-"""What RViz draws of a drone in the frame `map`: one MarkerArray, which takes the place of the one before. Pure."""
+"""Markers of a drone for RViz, in the frame `map`: one MarkerArray, which replaces the one before. Pure."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from flockd.fleet.ros.message_trees import LEVEL_TURN, Tree, header, turn, vecto
 from flockd.fleet.ros.ros_frames import MAP, attitude_in_ros, attitude_of_angles, enu_of_ned
 
 COURSE_S = 2.0
-"""A course leads to where the drone is then."""
+"""Time ahead to which a course is drawn."""
 COLOURS = (
     (0.0, 0.45, 0.7),
     (0.9, 0.62, 0.0),
@@ -27,11 +27,11 @@ _FENCE, _LABEL = (0.8, 0.2, 0.2), (1.0, 1.0, 1.0)
 _ARROW, _SPHERE, _CYLINDER, _LINE_STRIP, _TEXT = 0, 2, 3, 4, 9
 _DELETE_ALL = 3
 _ABOVE = np.array([0.0, 0.0, 0.6])
-"""From a drone to its name."""
+"""Distance of a drone's name from the drone, metres."""
 
 
 def markers(time_ns: int, name: str, number: int, row: Row) -> Tree:
-    """Of one drone; nothing but its deletion where its position is not known. ``number`` chooses its colour."""
+    """Markers of one drone; only their deletion if its position is not known. ``number`` chooses its colour."""
     drawn: list[Tree] = [{"header": header(time_ns, MAP), "action": _DELETE_ALL}]
     place = place_in_map(row)
     if place is not None:
@@ -47,14 +47,14 @@ def markers(time_ns: int, name: str, number: int, row: Row) -> Tree:
 
 
 def place_in_map(row: Row) -> FloatArray | None:
-    """(3,) metres east, north, up; None where the position is not known."""
+    """(3,) metres east, north, up; None: the position is not known."""
     if row["position_ne"] is None:
         return None
     return home_in_map(row) + enu_of_ned(np.array([*row["position_ne"], -(row["height_m"] or 0.0)]))
 
 
 def home_in_map(row: Row) -> FloatArray:
-    """(3,) metres to the drone's home; zeros where that is not known."""
+    """(3,) metres to the drone's home; zeros if it is not known."""
     return enu_of_ned(np.array([*(row["home_ne"] or (0.0, 0.0)), 0.0]))
 
 
@@ -72,7 +72,7 @@ def _body(name: str, row: Row, place: FloatArray, colour: tuple[float, ...]) -> 
 
 
 def _course(row: Row, place: FloatArray, colour: tuple[float, ...]) -> Iterable[Tree]:
-    """The own estimate, thick; what the flock law asks for, thin; and the goal."""
+    """The estimated course, thick; the flocking law's command, thin; and the goal."""
     for velocity, alpha, thickness_m in ((row["velocity_ned"], 1.0, 0.08), (row["command_ne"], 0.5, 0.03)):
         if velocity is not None:
             end = place + COURSE_S * enu_of_ned(np.array([*velocity, 0.0][:3]))
@@ -84,7 +84,7 @@ def _course(row: Row, place: FloatArray, colour: tuple[float, ...]) -> Iterable[
 
 
 def _neighbours(row: Row, place: FloatArray, colour: tuple[float, ...]) -> Iterable[Tree]:
-    """Where it believes others to be: a sphere of one standard deviation at the end of a line."""
+    """Its neighbours: a sphere of one standard deviation at the end of a line."""
     for one in (one for one in row["sees"] if one["ned"] is not None):
         there = place + enu_of_ned(np.array(one["ned"]))
         tint = _tint(colour, 0.6 if one["confirmed"] else 0.25)
@@ -93,7 +93,7 @@ def _neighbours(row: Row, place: FloatArray, colour: tuple[float, ...]) -> Itera
 
 
 def _fence(row: Row) -> Iterable[Tree]:
-    """On the ground."""
+    """The fence, on the ground."""
     fence, home = row["fence"] or {}, home_in_map(row)
     angles = np.linspace(0.0, 2 * math.pi, 73)
     circle = (fence.get("radius_m") or 0.0) * np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)

@@ -1,8 +1,7 @@
 """ROS 2's standard messages as trees of plain values, built from flockd's. Pure: neither a clock nor ROS is needed.
 
-A tree is a mapping from a message's fields to numbers, text, bytes, arrays, trees and lists of trees; a field that it
-lacks is 0, as `rclpy` makes messages (`ros_node.py`). Arguments are in flockd's axes, and what comes out is in those of
-REP 103.
+A tree maps a message's fields to numbers, text, bytes, arrays, trees and lists of trees. Missing fields are 0, as in
+new messages of `rclpy` (`ros_node.py`). Arguments are in flockd's axes, results in those of REP 103.
 """
 
 from __future__ import annotations
@@ -42,7 +41,7 @@ _FLOAT64, _UINT32, _UINT8 = 8, 6, 2  # of sensor_msgs/msg/PointField
 
 
 def ros_name(name: str) -> str:
-    """The nearest name that ROS 2 takes as a part of a topic: letters, digits and `_`, and no digit first."""
+    """The nearest name that ROS 2 permits in a topic: letters, digits and `_`, without a digit at the beginning."""
     plain = re.sub(r"_+", "_", re.sub(r"[^A-Za-z0-9]", "_", name))
     return f"d{plain}" if plain[:1].isdigit() else plain or "drone"
 
@@ -88,8 +87,7 @@ def state_odometry(time_ns: int, names: Names, state: StateMessage) -> Tree | No
     """Of telemetry's `state`: where the body is from home, and its velocity in its own axes, as the message's
     definition asks for. None where the drone does not know its position.
 
-    Covariances are zero, which says that they are not known; so is a velocity that is not known, with a variance of -1
-    to tell it from a standstill.
+    Covariances are zero, which means not known. A velocity that is not known is zero with a variance of -1.
     """
     place, velocity_ned = _known(state["position_ne"], 2), _known(state["velocity_ned"], 3)
     if place is None or not _finite(state["height_m"]):
@@ -111,7 +109,7 @@ def state_odometry(time_ns: int, names: Names, state: StateMessage) -> Tree | No
 
 
 def attitude_of_state(state: StateMessage) -> FloatArray:
-    """R_ned_frd (3, 3); level and to the north where it is not known."""
+    """R_ned_frd (3, 3); level and facing north if it is not known."""
     return rf.attitude_of_angles(*(state[key] or 0.0 for key in ("roll_deg", "pitch_deg", "yaw_deg")))
 
 
@@ -126,7 +124,7 @@ _POINT = np.dtype([(name, {_FLOAT64: "<f8", _UINT32: "<u4", _UINT8: "u1"}[kind])
 
 
 def neighbour_poses(time_ns: int, names: Names, neighbours: Sequence[NeighbourMessage]) -> Tree:
-    """Where each neighbour is from the drone, in the order of `tracks`. Which way it faces is not known."""
+    """Positions of neighbours from the drone, in the order of `tracks`. Their headings are not known."""
     positions = [rf.enu_of_ned(np.array(one["position_ned"])) for one in usable(neighbours)]
     return {
         "header": header(time_ns, names.level),
@@ -135,7 +133,7 @@ def neighbour_poses(time_ns: int, names: Names, neighbours: Sequence[NeighbourMe
 
 
 def tracks(time_ns: int, names: Names, neighbours: Sequence[NeighbourMessage]) -> Tree:
-    """A PointCloud2 with a point a neighbour, of `TRACK_FIELDS`: with covariance, velocity and track number."""
+    """A PointCloud2 with a point of `TRACK_FIELDS` for each neighbour: with variances, velocity and track number."""
     used = usable(neighbours)
     points = np.zeros(len(used), _POINT)
     for point, one in zip(points, used, strict=True):
@@ -163,7 +161,7 @@ def tracks(time_ns: int, names: Names, neighbours: Sequence[NeighbourMessage]) -
 
 
 def usable(neighbours: Sequence[NeighbourMessage]) -> list[NeighbourMessage]:
-    """Those whose numbers are all there: a peer may have sent none."""
+    """The neighbours with complete numbers: a peer may have sent incomplete ones."""
     numbers = ("position_sigma_m", "velocity_sigma_m_s", "age_s", "unseen_s")
     return [
         one
@@ -177,8 +175,8 @@ def usable(neighbours: Sequence[NeighbourMessage]) -> list[NeighbourMessage]:
 def scan(time_ns: int, names: Names, obstacles: ObstaclesMessage) -> Tree | None:
     """Ranges counter-clockwise from west, by REP 117: infinite is free as far as ``range_max``, NaN is not known.
 
-    A direction that is known to be free but not as far is NaN, so that nobody clears what was not seen; how far it is
-    known stands in ``intensities``, in metres. None where the sectors cannot be turned into a scan.
+    A direction that is known to be free up to a shorter range is NaN, so that unseen space is not cleared;
+    ``intensities`` has that range in metres. None: the sectors cannot be converted to a scan.
     """
     count = len(obstacles["range_m"])
     if count == 0 or count % 4 or len(obstacles["seen_m"]) != count:
@@ -210,7 +208,7 @@ def diagnostics(time_ns: int, statuses: Sequence[Tree]) -> Tree:
 
 
 def diagnostic(name: str, level: int, sentence: str, values: Mapping[str, object]) -> Tree:
-    """A DiagnosticStatus; what is not known is left out of its values."""
+    """A DiagnosticStatus; unknown values are left out."""
     known = [{"key": key, "value": _written(value)} for key, value in values.items() if value is not None]
     return {"level": level, "name": name, "message": sentence, "hardware_id": name.partition(":")[0], "values": known}
 
@@ -231,7 +229,7 @@ def _written(value: object) -> str:
 
 
 def _known(values: object, size: int) -> FloatArray | None:
-    """A list of a peer's; None where a number is missing."""
+    """A list from a peer; None: a number is missing."""
     if not isinstance(values, list) or len(values) != size or not all(map(_finite, values)):
         return None
     return np.array(values, np.float64)

@@ -1,4 +1,4 @@
-"""Perception alone, for other people's stacks: images in, neighbours out. Nothing is commanded."""
+"""Perception alone, for other software: computes neighbours from images, and commands nothing."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _TELL_S = 1.0
 
 
 def check(config: DroneConfig, vehicle_topic: str | None) -> None:
-    """Raises UsageError where the configuration needs a height and no topic gives one."""
+    """Raises UsageError if the configuration needs a height and no topic gives one."""
     if vehicle_topic is None and config.perception.scale == "height":
         raise UsageError(
             "perception.scale: is `height`, which needs a height; name odometry or a pose with --vehicle, or "
@@ -35,14 +35,14 @@ def check(config: DroneConfig, vehicle_topic: str | None) -> None:
 
 
 class PerceptionNode:
-    """Sees drones in the images of a source, and publishes them.
+    """Detects and tracks drones in the images of a source, and publishes them.
 
     Without the vehicle's state it assumes that the drone is level and faces north: y of `DRONE/level` is then ahead,
-    and x to the right. `check` comes first.
+    and x to the right. Call `check` first.
     """
 
     def __init__(self, config: DroneConfig, node: RosNode, vehicle_topic: str | None) -> None:
-        """``node`` stays its owner's. Raises ModelError."""
+        """The caller closes ``node``. Raises ModelError."""
         self._config, self._node, self._vehicle_topic = config, node, vehicle_topic
         self._names = Names(ros_name(config.name))
         self._pilot = FlockPilot(config, load_side_by_side(config), stopwatch=time.perf_counter)
@@ -50,8 +50,8 @@ class PerceptionNode:
         self._last_s, self._told_s = -np.inf, -np.inf
 
     def run(self, source: FrameSource) -> None:
-        """For ever."""
-        # Frames that come a little before a step is due are those of the step.
+        """Runs without end."""
+        # Frames that come a little early belong to the step.
         slack_s = 0.0 if self._config.source is None else self._config.source.set_tolerance_s
         source.start()
         try:
@@ -71,7 +71,7 @@ class PerceptionNode:
             source.stop()
 
     def _vehicle(self, time_s: float) -> VehicleState | None:
-        """Of the topic, whose kind is known only when it is there."""
+        """The vehicle's state; the type of its topic is known only when the topic exists."""
         if self._vehicle_topic is None:
             return VehicleState(time_s, np.eye(3), 0.0)
         if self._states is None:
@@ -85,14 +85,14 @@ class PerceptionNode:
         return self._states.at(time_s + self._config.rig.time_offset_s)
 
     def _missing(self) -> str:
-        """Why there is no state of the vehicle."""
+        """Why no state of the vehicle is known."""
         if self._states is not None:
             return f"no state of {self._vehicle_topic} is near the images' time; are their stamps of one clock?"
         there = ", ".join(self._node.kinds(self._vehicle_topic or "")) or "not published"
         return f"{self._vehicle_topic} is {there}; name one of {', '.join(STATES)} with --vehicle"
 
     def _publish(self, output: PilotOutput) -> None:
-        """Stamped as the images were."""
+        """Publishes neighbours, with the stamp of the images."""
         time_ns = round(1e9 * output.time_s) + time.time_ns() - time.monotonic_ns()
         seen, space = [neighbour_message(one) for one in output.neighbours], f"/{self._names.drone}"
         poses, tracks = (make(time_ns, self._names, seen) for make in (trees.neighbour_poses, trees.tracks))
@@ -100,7 +100,7 @@ class PerceptionNode:
         self._node.publish(f"{space}/neighbours/tracks", trees.POINT_CLOUD, tracks, Delivery.SENSOR)
 
     def _tell(self, source: FrameSource, reasons: Sequence[str] | None) -> None:
-        """Publishes once a second what is wrong. ``reasons``: None while no images come."""
+        """Publishes faults once a second. ``reasons``: None: no images come."""
         now_s = time.monotonic()
         if now_s - self._told_s < _TELL_S:
             return

@@ -1,4 +1,4 @@
-"""Between flockd's axes and those of ROS, by its REP 103 and REP 105: the only place that converts them. Pure.
+"""Converts between flockd's axes and those of ROS (REP 103 and REP 105). No other file does. Pure.
 
 flockd's world is north, east, down (NED), its body forward, right, down (FRD); those of ROS are east, north, up (ENU)
 and forward, left, up (FLU).
@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from flockd.core.messages import FloatArray, IntArray
 
 MAP = "map"
-"""REP 105: the world of all drones, which does not drift; here with its origin at the home of one of them."""
+"""REP 105's frame of the world of all drones, which does not drift; its origin is the home of one drone."""
 _ENU_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 _FLU_FRD = np.diag([1.0, -1.0, -1.0])
 
@@ -61,7 +61,7 @@ def quaternion_of(R: FloatArray) -> FloatArray:
 
 
 def rotation_of(quaternion: FloatArray) -> FloatArray:
-    """(3, 3) of x, y, z, w. Raises ValueError for what is not of length 1, to a hundredth: a message left empty."""
+    """(3, 3) of x, y, z, w. Raises ValueError if the length is not 1 within a hundredth, as in an empty message."""
     length = float(np.linalg.norm(quaternion))
     if not abs(length - 1.0) < 0.01:  # true for NaN too
         raise ValueError(f"its orientation is no rotation: a quaternion of length {length:.3g}; fill it in")
@@ -70,7 +70,7 @@ def rotation_of(quaternion: FloatArray) -> FloatArray:
 
 
 def scan_order(count: int) -> IntArray:
-    """For each ray of a scan in ENU the sector of `ObstacleRanges`, in which azimuths count clockwise from north.
+    """For each ray of a scan in ENU, the sector of `ObstacleRanges`, whose azimuths are clockwise from north.
 
     The scan's first ray points at -180 degrees, which is west, its next ones counter-clockwise from there.
     """

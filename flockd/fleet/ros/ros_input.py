@@ -1,4 +1,4 @@
-"""What ROS 2's images and vehicle states say, of a bag or a node, without ROS."""
+"""Reads images and vehicle states from messages of ROS 2, of a bag or a node, without ROS."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ class RosImage:
 
     stamp_ns: int
     encoding: str
-    """Of an Image its `encoding`, of a CompressedImage its `format`."""
+    """`encoding` of an Image, `format` of a CompressedImage."""
     data: bytes
     size: tuple[int, int] | None = None
-    """Width, height; None of a CompressedImage."""
+    """Width, height; None: a CompressedImage."""
     bytes_per_line: int | None = None
 
 
 def image_of(message: Any) -> RosImage:
-    """Of a message of `rosbags` or rclpy, whose fields have the same names."""
+    """The image of a message of `rosbags` or rclpy, whose fields have the same names."""
     if not hasattr(message, "encoding"):
         return RosImage(stamp_ns(message), message.format, bytes(message.data))
     size = message.width, message.height
@@ -40,21 +40,20 @@ def image_of(message: Any) -> RosImage:
 
 
 PX4_ODOMETRY, PX4_ATTITUDE = "px4_msgs/msg/VehicleOdometry", "px4_msgs/msg/VehicleAttitude"
-"""PX4's own, without a header."""
+"""PX4's messages, which have no header."""
 STATES = (ODOMETRY, PX4_ODOMETRY, POSE, IMU, PX4_ATTITUDE)
-"""What a vehicle's state may come from, the best first."""
+"""Types of messages with a vehicle's state, the best first."""
 LONGEST_GAP_S = 0.2
-"""Between the state and the images that it is of."""
+"""Longest time between a state and its images."""
 
 
 def stamp_ns(message: Any) -> int:
-    """Of a message with a header."""
+    """Stamp of a message with a header, ns."""
     return int(message.header.stamp.sec) * _NS + int(message.header.stamp.nanosec)
 
 
 def state_stamp_ns(kind: str, message: Any, arrived_ns: int) -> tuple[int, bool]:
-    """When a state was true, and whether that is when it arrived, as PX4 stamps by a clock of its own: from its start,
-    not from 1970."""
+    """Time of a state, ns, and whether that is its arrival: PX4's stamps count from its start instead of from 1970."""
     if kind not in {PX4_ODOMETRY, PX4_ATTITUDE}:
         return stamp_ns(message), False
     own_clock = abs((stamp := 1000 * int(message.timestamp)) - arrived_ns) > _NS
@@ -62,7 +61,7 @@ def state_stamp_ns(kind: str, message: Any, arrived_ns: int) -> tuple[int, bool]
 
 
 def check_height(topic: str, kind: str, config: DroneConfig) -> None:
-    """Raises UsageError where the configuration needs a height and states of that kind have none."""
+    """Raises UsageError if the configuration needs a height and states of that kind have none."""
     if kind in {IMU, PX4_ATTITUDE} and config.perception.scale == "height":
         raise UsageError(
             f"{topic} has an attitude and no height; set perception.scale to `network`, or name odometry with --vehicle"
@@ -70,7 +69,7 @@ def check_height(topic: str, kind: str, config: DroneConfig) -> None:
 
 
 def vehicle_state(kind: str, message: Any, time_s: float) -> VehicleState | None:
-    """None for a message whose orientation nobody filled in. An attitude alone knows no height, so that it is 0.
+    """The vehicle's state; None: the message has no orientation. The height of an attitude alone is 0.
 
     ``message``: of rclpy or `rosbags`, whose fields have the same names; ``kind``: one of `STATES`.
     """
@@ -95,7 +94,7 @@ _NED, _BODY_FRD = 1, 3
 
 
 def _px4_state(kind: str, message: Any, time_s: float) -> VehicleState | None:
-    """Of messages whose axes are flockd's; None where PX4's estimator had none."""
+    """The state of PX4's messages, which have flockd's axes; None: PX4's estimator had none."""
     try:
         R_ned_body = rotation_of(np.array([*message.q[1:], message.q[0]], np.float64))
     except ValueError:
@@ -111,17 +110,17 @@ def _px4_state(kind: str, message: Any, time_s: float) -> VehicleState | None:
 
 
 class NearestState:
-    """Keeps the newest states, from any thread, and gives the one that is nearest in time."""
+    """Keeps the newest states, from any thread, and finds the one nearest in time."""
 
     def __init__(self, kept: int | None = 500) -> None:
-        """``kept``: so many of the newest; None: all."""
+        """``kept``: number of states that are kept; None: all."""
         self._kept = kept
         self._states: list[VehicleState] = []
         """In the order of their times."""
         self._lock = threading.Lock()
 
     def add(self, state: VehicleState | None) -> None:
-        """One more; None is none."""
+        """Adds a state, unless it is None."""
         if state is not None:
             with self._lock:
                 insort(self._states, state, key=_time_s)
@@ -129,7 +128,7 @@ class NearestState:
                     del self._states[: -self._kept]
 
     def at(self, time_s: float) -> VehicleState | None:
-        """None where none is within `LONGEST_GAP_S`."""
+        """The state nearest to a time; None: none is within `LONGEST_GAP_S`."""
         with self._lock:
             after = bisect(self._states, time_s, key=_time_s)
             around = self._states[max(after - 1, 0) : after + 1]

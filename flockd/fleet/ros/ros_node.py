@@ -1,6 +1,6 @@
-"""The one adapter to rclpy, ROS 2's client library: a node that publishes, subscribes and serves trees of plain values.
+"""The adapter of rclpy, ROS 2's client library: a node that publishes, subscribes and serves trees of plain values.
 
-rclpy comes with a ROS 2 that is sourced, or from PyPI with the extra `ros`. Callbacks run on threads of the node's own.
+rclpy comes with a sourced ROS 2, or from PyPI with the extra `ros`. Callbacks run on threads of the node.
 """
 
 from __future__ import annotations
@@ -20,32 +20,32 @@ from flockd.core.errors import UnavailableError
 from flockd.fleet.ros.message_trees import Tree
 
 HERE_ONLY = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-"""Environment of a node that only this computer's nodes find: ROS 2 has no access rules of its own."""
+"""Environment of a node that only nodes of this computer find, because ROS 2 has no access rules."""
 NOT_INSTALLED = "there is no rclpy; source a ROS 2, or, with Python 3.11 on x86-64 Linux, pip install -e '.[ros]'"
 _THREADS = 64
-"""At once, as far as there is work: an order may wait some seconds for a drone that is silent."""
+"""Threads for callbacks: an order may wait some seconds for a silent drone."""
 _TRIGGER = "std_srvs/srv/Trigger"
 _ELEMENT = re.compile(r"(?:sequence<)?([a-z0-9_]+/\w+)(?:, \d+)?>?(?:\[\d*\])?")
 
 
 class Delivery(Enum):
-    """How messages of a topic are delivered: their QoS."""
+    """QoS of a topic."""
 
     SENSOR = auto()
-    """Best effort, the newest five: as sensors publish."""
+    """Best effort, the newest five, as for sensors."""
     STATE = auto()
-    """Reliable, and the newest is kept for whoever comes later (transient local)."""
+    """Reliable and transient local: a late subscriber gets the newest message."""
     EVENT = auto()
     """Reliable, the newest ten."""
     ORDER = auto()
-    """Reliable, the newest: of those that wait while one is taken the others are dropped."""
+    """Reliable, only the newest: older messages that wait are dropped."""
 
 
 class RosNode:
-    """A node between ``__enter__`` and ``__exit__``. Raises UnavailableError where there is no ROS 2."""
+    """A node between ``__enter__`` and ``__exit__``. Raises UnavailableError without ROS 2."""
 
     def __init__(self, name: str, *, here_only: bool) -> None:
-        """``here_only``: other computers do not find it, unless the environment already says who may."""
+        """``here_only``: other computers do not find it, unless the environment already sets the discovery range."""
         if here_only and "ROS_LOCALHOST_ONLY" not in os.environ:
             for key, value in HERE_ONLY.items():
                 os.environ.setdefault(key, value)
@@ -87,15 +87,15 @@ class RosNode:
         self._publishers[topic].publish(_message(_type(kind), tree))
 
     def kinds(self, topic: str) -> list[str]:
-        """Types of what is published there now."""
+        """Types of a topic's current publishers."""
         return sorted({one.topic_type for one in self._node.get_publishers_info_by_topic(topic)})
 
     def subscribe(self, topic: str, kind: str, take: Callable[[Any], None], delivery: Delivery) -> None:
-        """Calls ``take`` with one message of rclpy after the other, on a thread of the node's. It may wait."""
+        """Calls ``take`` with each message of rclpy, one at a time, on a thread of the node. It may wait."""
         self._node.create_subscription(_type(kind), topic, take, _profile(delivery), callback_group=_one_at_a_time())
 
     def serve(self, name: str, answer: Callable[[], tuple[bool, str]]) -> None:
-        """A Trigger service; ``answer``: whether it succeeded, and a sentence. It may wait."""
+        """Makes a Trigger service; ``answer`` returns whether it succeeded, and a sentence. It may wait."""
 
         def respond(_: Any, response: Any) -> Any:
             response.success, response.message = answer()
@@ -113,7 +113,7 @@ class RosNode:
 
 
 def has_type(kind: str) -> bool:
-    """Whether this ROS 2 has a message type: those of PyPI lack a few."""
+    """Whether this ROS 2 has a message type; the wheels of PyPI lack a few."""
     try:
         _type(kind)
     except UnavailableError:
@@ -122,7 +122,7 @@ def has_type(kind: str) -> bool:
 
 
 def _rclpy() -> Any:
-    """Raises UnavailableError without any, and for that of another Python."""
+    """Imports rclpy. Raises UnavailableError if it is missing or made for another Python."""
     try:
         import rclpy  # noqa: PLC0415 - of an extra, or of a ROS 2 that is sourced
     except ImportError as error:

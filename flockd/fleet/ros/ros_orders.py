@@ -1,4 +1,4 @@
-"""Orders as they come from ROS 2, turned into those of flockd; whether one may be flown is the drone's to say."""
+"""Converts orders of ROS 2 to flockd's; the drone decides whether to fly one."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from flockd.onboard.telemetry.topics import AboutMessage, OrderMessage
 
 
 def goal_of(message: Any, names: Names, row: Row, about: AboutMessage | None) -> OrderMessage:
-    """Of a PoseStamped in `map` or the drone's `odom`. Its orientation says nothing; a height of 0 is as it is now.
+    """The goal of a PoseStamped in `map` or the drone's `odom`. Its orientation is ignored; height 0 keeps the height.
 
     ``message``: with the fields of rclpy's. Raises ValueError, with a sentence for its sender.
     """
@@ -38,7 +38,7 @@ def goal_of(message: Any, names: Names, row: Row, about: AboutMessage | None) ->
 
 
 def velocity_of(message: Any, names: Names, row: Row, _: AboutMessage | None) -> OrderMessage:
-    """Of a TwistStamped in `map`, the drone's `odom` or `level`, or its body. Level: flockd keeps height and heading.
+    """The velocity of a TwistStamped in `map`, the drone's `odom` or `level`, or its body. It must be horizontal.
 
     ``message``: with the fields of rclpy's. Raises ValueError, with a sentence for its sender.
     """

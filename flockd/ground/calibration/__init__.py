@@ -1,1 +1,1 @@
-"""Calibrates cameras: their lenses, where they sit, and how their time and the autopilot's differ."""
+"""Calibrates cameras: lens, mounting, and time offset to the autopilot."""

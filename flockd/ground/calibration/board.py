@@ -16,20 +16,20 @@ from flockd.flight.geometry import Camera, RigidTransform, rotation_from_vector
 
 
 class CalibrationError(FlockdError):
-    """The images or numbers given are not enough, or contradict each other, for a calibration to fly with."""
+    """Images or numbers do not suffice for a calibration, or contradict each other; the text says what to do."""
 
 
 _DICTIONARY, _MARKERS, _MARKER_SHARE = cv2.aruco.DICT_4X4_50, 50, 0.75
 """ArUco markers of 4 by 4 cells, 50 of them; and the share of a square's side that a marker takes."""
 MIN_CORNERS = 8
-"""Fewer corners do not determine where the board is."""
+"""Least number of corners that determine the board's pose."""
 CENTRE_PX = 0.5
 """OpenCV has pixel centres at whole numbers."""
 
 
 @dataclass(frozen=True)
 class BoardSpec:
-    """A board as it is printed. Raises CalibrationError for one that cannot be made."""
+    """A printed board. Raises CalibrationError for an impossible one."""
 
     columns: int = 7
     rows: int = 5
@@ -37,7 +37,7 @@ class BoardSpec:
     square_m: float = 0.036
     """Side of a chessboard square."""
     legacy: bool = False
-    """Made by OpenCV before 4.6: with an even number of rows a marker stands in the first square, not beside it."""
+    """Whether OpenCV before 4.6 made it: with an even number of rows the first square then has a marker."""
 
     def __post_init__(self) -> None:
         if min(self.columns, self.rows) < 3 or max(self.columns, self.rows) > 50:
@@ -54,12 +54,12 @@ class BoardSpec:
 
     @property
     def last_marker(self) -> int:
-        """Its number; the first is 0."""
+        """Number of the last marker; the first is 0."""
         return self.columns * self.rows // 2 - 1
 
     @property
     def corner_count(self) -> int:
-        """Inner corners of the chessboard: what is found in images."""
+        """Number of inner corners of the chessboard, which are detected in images."""
         return (self.columns - 1) * (self.rows - 1)
 
     def image(self, pixels_per_square: int) -> UInt8Array:
@@ -70,10 +70,10 @@ class BoardSpec:
 
 @dataclass(frozen=True, eq=False)
 class BoardDetection:
-    """The board's corners that are seen in one image."""
+    """The board's corners in one image."""
 
     ids: IntArray
-    """(n,) their numbers, row by row from the first corner of the board."""
+    """(n,) numbers of the corners, row by row from the first corner of the board."""
     pixels: FloatArray
     """(n, 2) pixels with centres at +0.5."""
     points: FloatArray
@@ -91,7 +91,7 @@ class BoardFinder:
         """The last image in which there was no board."""
 
     def find(self, grey: UInt8Array) -> BoardDetection | None:
-        """The board in a (h, w) image; None where fewer than `MIN_CORNERS` are seen, or all in one line."""
+        """The board in an image (h, w); None: fewer than `MIN_CORNERS` corners are visible, or all are in one line."""
         corners, ids, _, _ = self._detector.detectBoard(grey)
         if ids is None or len(ids) < MIN_CORNERS:
             self._without = grey
@@ -150,7 +150,7 @@ def page_mm(spec: BoardSpec) -> tuple[float, float]:
 
 
 def board_svg(spec: BoardSpec) -> str:
-    """One page: the board in its true size, what it is, and a line to check the printer with."""
+    """One page: the board in its true size, its description, and a line to check the printer with."""
     width, height = page_mm(spec)
     cell_mm = 1000.0 * spec.square_m / _CELLS
     black = "".join(f"M{x} {y}h1v1h-1z" for y, x in np.argwhere(spec.image(_CELLS) == 0))
@@ -167,11 +167,11 @@ def board_svg(spec: BoardSpec) -> str:
 
 _FACTOR = 2.5
 MAX_DROPPED = 1 / 3
-"""Share of all views that may be dropped; where more contradict the others, it is not known which are right."""
+"""Share of all views that may be dropped; if more contradict the others, the right ones are not known."""
 
 
 def inliers(rms_px: FloatArray, margin_px: float) -> BoolArray:
-    """Mask (n,) of residuals (n,) that are no outliers: within `_FACTOR` times the median, or ``margin_px`` above."""
+    """Mask (n,) of residuals (n,) that are inliers: within `_FACTOR` times the median, or ``margin_px`` above it."""
     median = float(np.median(rms_px))
     kept: BoolArray = rms_px <= max(_FACTOR * median, median + margin_px)
     return kept
@@ -183,17 +183,17 @@ def root_mean_square(residuals: FloatArray) -> float:
 
 
 _NEAREST_ANGLE = 0.15
-"""Cosine of the largest angle from the board's middle at which a corner still helps to find a first pose."""
+"""Cosine of the largest angle from the board's centre at which corners are used for the first pose."""
 
 
 def residuals_px(camera: Camera, seen: BoardDetection, pose: RigidTransform) -> FloatArray:
-    """(n, 2) pixels, seen less predicted; ``pose``: ``T_camera_board``."""
+    """(n, 2) pixels, measured minus predicted; ``pose``: ``T_camera_board``."""
     return seen.pixels - camera.project(pose.apply(seen.points))
 
 
 def first_pose(camera: Camera, seen: BoardDetection) -> tuple[float, RigidTransform | None]:
-    """``T_camera_board`` by the board's outline (IPPE), and its residual; no pose, and infinity, where it fits none. Of
-    the two poses that a flat board may have by its outline, the likelier."""
+    """``T_camera_board`` by IPPE, and its residual; None and infinity if no pose fits. Of the two poses that a flat
+    board may have, it is the likelier one."""
     rays = camera.rays(seen.pixels)
     usable = np.isfinite(rays).all(axis=1)
     if not usable.any():

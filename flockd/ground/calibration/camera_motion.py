@@ -1,8 +1,8 @@
-"""How each camera moved by what it alone saw, with how well that is known: what calibration of a rig in flight uses.
+"""The motion of each camera by its own images, with covariance, for the calibration of a rig in flight.
 
-A match fixes the direction of its point before and after. The depth map says how far it is, with a large error: the
-part of a residual that a wrong depth explains loses its weight, as in `ego_motion_refinement`. So near points count by
-their epipolar lines, and far ones fix the rotation.
+A match gives the directions of its point in both images; the depth map gives its range, with a large error. As in
+`ego_motion_refinement`, the part of a residual that a wrong depth explains has less weight. So near points contribute
+by their epipolar lines, and far ones fix the rotation.
 """
 
 from __future__ import annotations
@@ -23,21 +23,19 @@ from flockd.flight.geometry.transform import RigidTransform
 
 MIN_MATCHES = 40
 _MAX_MATCHES = 300
-"""More matches are thinned out evenly, and each that is left counts for those beside it: their errors are common. With
-600 the four rigs of a simulated flight were found no better."""
+"""Largest number of matches. More are thinned out evenly, because neighbouring errors are correlated; 600 were no
+better for the four rigs of a simulated flight."""
 _ROUNDS, _FINE_ROUNDS = 7, 4
 _NEAR, _THERE = 1.0, 1e-2
-"""Squares of standard deviations that a step is long: below the first the fine rounds begin, below the second they
-end."""
+"""Squared length of a step in standard deviations below which the fine iterations begin, and end."""
 _DEPTH_SIGMA = 3.0
 """Relative error of a depth, and of all depths of an image together."""
 _FLOW_PX = 0.2
 """Least standard deviation of a match, pixels."""
 _MATCHES_A_FLOW = 4.0
-"""So many matches err together: a dense flow is smooth."""
+"""Number of matches with a common error: a dense flow is smooth."""
 _CAUCHY_SIGMAS, _TUKEY_SIGMAS = 2.385, 4.685
-"""The first is for a start that is far off; the second for the fine rounds, because false matches bias a focal
-length."""
+"""Kernels for a distant start, and for the fine iterations, because false matches bias a focal length."""
 _FOCAL_STEP = 1e-3
 _MAX_CONDITION = 1e12
 _ROTATION, _TRANSLATION, _DEPTH = slice(0, 3), slice(3, 6), 6
@@ -82,7 +80,7 @@ def scaled_focal(camera: Camera, log_scale: float) -> Camera:
 def camera_motion(
     mounted: RigCamera, pairs: PointPairs, start: RigidTransform, log_focal: float
 ) -> CameraMotion | None:
-    """The motion that best explains the pairs of one camera; None where they are too few, or do not determine it.
+    """The motion that best explains the pairs of one camera; None: they are too few, or do not determine it.
 
     Args:
         mounted: as the pairs were lifted.

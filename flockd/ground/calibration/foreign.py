@@ -1,6 +1,6 @@
 """Calibrations by other programs: Kalibr's camchain, ROS's camera_info, OpenCV's FileStorage, COLMAP's cameras.txt.
 
-The lenses that these share with flockd are taken as they are. For others the nearest lens is fitted.
+Lens models that flockd also has are taken over exactly; for others the nearest lens is fitted.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ _COLMAP: Mapping[str, tuple[str, str]] = {
     "DIVISION": ("division", "fx fy cx cy k"),
     "EUCM": ("none", "fx fy cx cy alpha beta"),
 }
-"""The distortion of each model, and what its parameters are."""
+"""The distortion of each model, and the names of its parameters."""
 _KALIBR = {"pinhole": "", "omni": "xi", "ds": "xi alpha", "eucm": "alpha beta"}
-"""What stands before fx, fy, cx, cy."""
+"""Names of the parameters before fx, fy, cx, cy."""
 
 
 def foreign_lenses(file: Path, size: tuple[int, int] | None) -> list[ForeignLens]:
@@ -179,19 +179,18 @@ def _opencv(file: Path) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Imported:
-    """A camera as configuration, and by how many degrees its lens differs from the file's over the image."""
+    """A camera as configuration, and the difference of its lens from the file's over the image."""
 
     camera: CameraConfig
     off_deg: float = 0.0
-    """At most; 0 for the same lens."""
+    """Largest difference, degrees; 0 for the same lens."""
     rms_deg: float = 0.0
 
 
 def camera_of_lens(lens: ForeignLens, file: Path, *, nearest: bool) -> Imported:
     """As flockd has it.
 
-    Raises CalibrationError for a lens that flockd has not, unless the ``nearest`` may be taken, and for one that cannot
-    be true.
+    Raises CalibrationError for an impossible lens, and for a model that flockd lacks unless ``nearest`` permits a fit.
     """
     where, count = f"{file}: {lens.name}", len(lens.distortion)
     model: LensModel = "wide_angle" if lens.model in _FISHEYES else "pinhole"

@@ -1,4 +1,4 @@
-"""Calibrated numbers as configuration: a `rig` section that checks, and that a drone's file can take as it is."""
+"""Calibrated numbers as configuration: a valid `rig` section that can be copied into a drone's file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a flight found of its rig, by its recording: as a rig to fly with, where it is known and differs."""
+"""Corrects a rig by the recording of a flight, where the flight determines a value and it differs."""
 
 from __future__ import annotations
 
@@ -35,22 +35,22 @@ from flockd.onboard.recording.reader import Recording
 from flockd.onboard.recording.streams import is_image
 
 MAX_TURN_RAD, MAX_OFFSET_S, MAX_FOCAL = math.radians(0.5), 0.01, 0.01
-"""Largest standard deviations of a mounting about its worst axis, of a time, and of a focal length, to be taken
+"""Largest standard deviations of a mounting about its worst axis, of a time, and of a focal length that are taken
 over."""
 LEAST_S = 5.0
-"""Seconds of a flight that say enough."""
+"""Last seconds of a flight that are used."""
 _AGAIN = 60
-"""Number of first looks that are judged again by what all of them showed."""
+"""Number of first updates that are judged again by the result of all updates."""
 Look = tuple[Seen, Seen, PointPairs]
 
 
 def found_rig(
     recording: Recording, last_s: float = math.inf, progress: Callable[[int, int], None] = lambda done, total: None
 ) -> tuple[CameraDeviation, ...]:
-    """How each camera was in the last seconds of a flight, whose steps are computed again; none: it is too short.
+    """The deviation of each camera in the last seconds of a flight, whose steps are computed again; empty: it is too
+    short.
 
-    ``progress`` is called with the steps done and their total. Raises RecordingError where there are no images, and
-    ModelError.
+    ``progress`` is called with the steps done and their total. Raises RecordingError without images, and ModelError.
     """
     if not any(map(is_image, recording.contents.messages)):
         raise RecordingError(f"{recording.path}: holds no images, which the calibration needs; name another recording")
@@ -90,7 +90,7 @@ def found_rig(
 
 
 def judged_again(rig: Rig, first: RigCalibration, looks: Sequence[Look]) -> RigCalibration:
-    """The filter after the same looks, without what ``first`` does not expect after all of them."""
+    """The filter after the same updates, without measurements that contradict the final state of ``first``."""
     again = RigCalibration(rig, first)
     for look in looks:
         again.update(*look)
@@ -100,10 +100,10 @@ def judged_again(rig: Rig, first: RigCalibration, looks: Sequence[Look]) -> RigC
 def corrected_rig(
     recording: Recording, deviations: Sequence[CameraDeviation], source: str, out: Path
 ) -> dict[str, Any]:
-    """Writes the recording's rig, corrected by what `found_rig` found, to ``out`` and gives the result.
+    """Writes the recording's rig, corrected by `found_rig`, to ``out``, and returns the result.
 
-    What is not known well, and what differs by less than four standard deviations, stays as it was configured.
-    Raises CalibrationError where nothing is to be taken over.
+    Values that are not known well, or differ by less than four standard deviations, stay as configured. Raises
+    CalibrationError if no value is corrected.
     """
     found = {one.camera: one for one in deviations}
     if not found:
@@ -159,7 +159,7 @@ def corrected_rig(
 
 
 def _offset_s(found: Sequence[CameraDeviation]) -> tuple[float | None, str | None]:
-    """The correction of the rig's offset, or None; and a note where the cameras do not agree."""
+    """The correction of the rig's time offset, or None; and a note if the cameras do not agree."""
     known = [one for one in found if not one.elsewhere and math.sqrt(one.covariance[3, 3]) < MAX_OFFSET_S]
     if not known:
         return None, "the time of the cameras is not known, and kept: this flight turned too evenly"

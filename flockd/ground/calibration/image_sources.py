@@ -27,14 +27,14 @@ class ImageStream:
     images: Iterator[tuple[str, UInt8Array]]
     """Name, and (h, w, 3) RGB."""
     count: int
-    """How many there are about; 0 for a live camera."""
+    """Approximate number of images; 0 for a live camera."""
     live: bool
     identity: str
-    """What identifies the camera: its path, best that of its socket."""
+    """The camera's path, preferably that of its socket."""
 
 
 def from_folder(path: Path) -> ImageStream:
-    """All images of a folder, by name. Raises CalibrationError where there are none."""
+    """All images of a folder, by name. Raises CalibrationError if it has no images."""
     files = in_order(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES and file.is_file())
     if (others := unread(path.iterdir())) is not None:
         raise CalibrationError(f"{path}: has {others}")
@@ -45,8 +45,8 @@ def from_folder(path: Path) -> ImageStream:
 
 
 def from_camera(config: DroneConfig, file: str, name: str, enough: Callable[[], bool]) -> ImageStream:
-    """Frames of a drone's live camera, until there are enough views, the time is up or Ctrl-C. Raises ConfigError.
-    Reading raises UnavailableError when no frame comes."""
+    """Frames of a drone's live camera, until there are enough views, the time is up, or Ctrl-C. Raises ConfigError.
+    Reading raises UnavailableError if no frame comes."""
     rig = config.rig.model_copy(update={"cameras": tuple(one for one in config.rig.cameras if one.name == name)})
     source, device = config.source, None
     if source is not None and source.cameras:

@@ -36,27 +36,27 @@ _FIRST_FOCALS = {
     "pinhole": np.geomspace(0.3, 4.0, 9),
     "wide_angle": 1.0 / np.radians(np.linspace(60.0, 240.0, 9)),
 }
-"""Focal lengths to start from, in widths of the image."""
+"""Focal lengths at which the fit starts, in widths of the image."""
 _MARGIN_PX, _ROUNDS = 0.1, 5
-"""Of the rejection of outliers."""
+"""Iterations of the rejection of outliers."""
 _STEP = 1.5e-8
-"""Of a numeric derivative: the root of double precision."""
+"""Step of numeric derivatives: the root of double precision."""
 _MAX_STEPS, _GAIN = 60, 1e-10
-"""A fit ends after so many steps, or where a step gains no larger share: of the squares, or of the numbers."""
+"""A fit ends after this many steps, or when a step changes the squares, or the parameters, by a smaller share."""
 _UNKNOWN = 1e-13
 """Least eigenvalue of a scaled normal matrix: a smaller one is rounding."""
 _FOCAL_SIGMA = 0.01
-"""A focal length that the views leave more uncertain than this is not known."""
+"""Largest relative standard deviation of a focal length that counts as known."""
 _CENTRE_SIGMA = 0.01
 """The same for the principal point, in widths of the image."""
 _LEAST_TILT_DEG = 10.0
 CLEARLY_BETTER = 0.8
-"""A more complicated model is taken if its residual is less than this share of a simpler one's."""
+"""A more complicated model is chosen if its residual is below this share of a simpler one's."""
 
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """A calibrated camera, and how well the views agree on it."""
+    """A calibrated camera, with the residuals of its views."""
 
     model: LensModel
     camera: Camera
@@ -67,10 +67,10 @@ class Lens:
     poses: tuple[RigidTransform, ...]
     """``T_camera_board`` of each."""
     dropped: tuple[tuple[View, float], ...]
-    """Views that did not fit the others, each with its residual in pixels."""
+    """Views that contradict the others, each with its residual in pixels."""
 
     def residuals(self) -> list[FloatArray]:
-        """For each view (n, 2) pixels, seen less predicted."""
+        """For each view (n, 2) pixels, measured minus predicted."""
         return [residuals_px(self.camera, view.seen, pose) for view, pose in zip(self.views, self.poses, strict=True)]
 
     @property
@@ -80,7 +80,7 @@ class Lens:
 
     @property
     def tilts_deg(self) -> tuple[float, ...]:
-        """How far the board's plane was turned away from the image's, in each view."""
+        """Angle between the board's plane and the image's in each view, degrees."""
         return tuple(tilt_deg(pose) for pose in self.poses)
 
     @property
@@ -100,10 +100,10 @@ class Lens:
 
 
 def calibrate(views: Sequence[View], size: tuple[int, int], model: LensModel) -> Lens:
-    """The camera of this model with the least squared residual.
+    """Fits a camera of this model by least squares.
 
-    Raises CalibrationError for too few views, and for views from which the camera cannot be known: all square to it,
-    or not of one flat board.
+    Raises CalibrationError for too few views, and for views that do not determine the camera: without tilt, or not of
+    one flat board.
     """
     if len(views) < MIN_VIEWS:
         raise CalibrationError(
@@ -133,7 +133,8 @@ def calibrate(views: Sequence[View], size: tuple[int, int], model: LensModel) ->
 
 
 def simplest_that_fits(lenses: Sequence[Lens]) -> Lens:
-    """The first of some lenses, simplest first, that none fits clearly better than. All are fitted to the same views.
+    """The simplest lens to which no other is clearly superior. ``lenses`` begin with the simplest, all fitted to the
+    same views.
 
     Noise alone leaves one model a little less residual than another, and an absurd distortion can imitate a plain lens.
     """
@@ -142,7 +143,7 @@ def simplest_that_fits(lenses: Sequence[Lens]) -> Lens:
 
 
 def tilt_deg(pose: RigidTransform) -> float:
-    """How far the board's plane is turned away from the image's, 0 to 90."""
+    """Angle between the board's plane and the image's, degrees, 0 to 90."""
     return math.degrees(math.acos(min(abs(float(pose.rotation[2, 2])), 1.0)))
 
 
@@ -252,7 +253,7 @@ def _camera(model: LensModel, size: tuple[int, int], numbers: Iterable[float]) -
 
 
 ENOUGH_VIEWS, ENOUGH_SHARE = 20, 0.9
-"""Views are taken from a live camera until there are this many, which cover this share of the image."""
+"""Number of views from a live camera, and share of the image that they cover, at which it ends."""
 
 
 def collect_views(
@@ -263,8 +264,8 @@ def collect_views(
 ) -> None:
     """Gives the collector every image.
 
-    ``on_image`` is called with the number of images done and the number there are; ``on_advice``, with a live camera
-    only, with what the person who holds the board should do next, each time that changes.
+    ``on_image`` is called with the number of images done and their total; ``on_advice``, only for a live camera, with
+    the next instruction for the person who holds the board, each time it changes.
     """
     advised = ""
     for number, (name, image) in enumerate(images.images, start=1):
@@ -276,7 +277,7 @@ def collect_views(
 
 
 def is_enough(collector: Collector) -> bool:
-    """Whether a live camera has given enough views, which cover the image and are tilted enough."""
+    """Whether a live camera's views are enough, cover the image and are tilted enough."""
     if len(collector.views) < ENOUGH_VIEWS or collector.coverage is None or collector.size is None:
         return False
     tilts = rough_tilts_deg(collector.views, collector.size, "wide_angle")
@@ -284,9 +285,9 @@ def is_enough(collector: Collector) -> bool:
 
 
 def fit_lenses(collector: Collector, model: LensModel | None, source: str) -> list[Lens]:
-    """A lens of the model that was asked for, or one of each model that fits.
+    """A lens of the given model, or one of each model that fits.
 
-    Raises CalibrationError, which names ``source``, where there is nothing to fit or no model fits.
+    Raises CalibrationError, which names ``source``, without views or if no model fits.
     """
     counts = collector.counts()
     if collector.size is None:
@@ -356,7 +357,7 @@ def lens_result(lens: Lens, lenses: Sequence[Lens], collector: Collector) -> dic
 
 
 def _next_step(collector: Collector) -> str:
-    """For a person who holds a board before a live camera."""
+    """Instruction for a person who holds a board in front of a live camera."""
     assert collector.coverage is not None
     assert collector.size is not None
     head = f"{len(collector.views)} views, {100 * collector.coverage.share:.0f} % covered"

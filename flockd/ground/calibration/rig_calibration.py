@@ -1,13 +1,12 @@
-"""A rig calibrated by a flight: how each camera is turned, when it takes its images, its focal length; with covariance.
+"""Calibrates a rig by a flight: mounting, time offset and focal length of each camera, with covariance.
 
-An error-state Kalman filter. It compares how each camera moved between two images, by what it alone saw
-(`camera_motion`), with how the autopilot says that the body turned and went. The camera's turn is the body's seen from
-another side (hand and eye: Tsai and Lenz 1989), which fixes the mounting about what the drone did not turn about; so
-does the direction in which it went, as far as the autopilot's velocity is right. Images that are late turn late: their
-time follows from rates of turn (Li and Mourikis, "Online temporal calibration for camera-IMU systems", IJRR 2014;
-Qin and Shen, IROS 2018), and the focal length from how large turns appear. See also Kelly and Sukhatme,
-"Visual-inertial sensor fusion: localization, mapping and sensor-to-sensor self-calibration", IJRR 2011. What a flight
-does not show stays as uncertain as it was.
+An error-state Kalman filter. It compares the motion of each camera between two images (`camera_motion`) with the
+autopilot's motion of the body. The camera's rotation is the body's in other axes (hand-eye calibration: Tsai and Lenz
+1989), which determines the mounting about the axes across the rotation. So does the direction of the displacement, as
+far as the autopilot's velocity is right. The time offset follows from rates of turn (Li and Mourikis, "Online temporal
+calibration for camera-IMU systems", IJRR 2014; Qin and Shen, IROS 2018), and the focal length from the size of
+rotations. See also Kelly and Sukhatme, "Visual-inertial sensor fusion: localization, mapping and sensor-to-sensor
+self-calibration", IJRR 2011. Parameters that a flight does not show keep their initial uncertainty.
 """
 
 from __future__ import annotations
@@ -29,15 +28,15 @@ from flockd.flight.pilot.camera_agreement import moves_otherwise
 from flockd.ground.calibration.camera_motion import CameraMotion, camera_motion
 
 PRIOR_TURN_RAD, PRIOR_OFFSET_S, PRIOR_FOCAL = math.radians(4.0), 0.06, 0.04
-"""Standard deviations before anything was seen: each axis of a mounting, a time, a focal length's logarithm."""
+"""Initial standard deviations: each axis of a mounting, a time offset, the logarithm of a focal length."""
 _TURN_SIGMA_RAD, _LEAST_TURN_RAD, _TURN_GAIN = math.radians(0.15), math.radians(0.05), 0.1
-"""Of the autopilot's turn between two images, each axis: at the start, and at least. An attitude with more jitter than
-assumed looks like turns of the body about axes about which it never turned, and would determine mountings falsely. So
-the jitter is learnt from what all cameras agree on (expectation maximisation), each time by this share."""
+"""Standard deviation of the autopilot's rotation between two images, each axis: initial, and least; and the share by
+which it is learnt in each update, from the cameras' agreement (expectation maximisation). If it were too small, jitter
+of the attitude would look like rotations of the body and give wrong mountings."""
 _VELOCITY_SIGMA_M_S, _VELOCITY_TIME_S = 0.2, 10.0
-"""Error of the autopilot's velocity, each axis, which lasts (PX4's estimate: 0.15 m/s for seconds at a time)."""
+"""Standard deviation of the persistent error of the autopilot's velocity, each axis (PX4's: 0.15 m/s for seconds)."""
 _VELOCITY_NOISE_M_S = 0.1
-"""Added for what differs between two images: how the drone flew between them is not known."""
+"""Added for each pair of images, as the flight between them is not known."""
 _WAY_SIGMA = 0.03
 """Of the way that a camera sees, share of it, each axis: a network's flow has the direction off by 0.4 to 3.9 degrees
 (standard deviations of cameras in realistic flights, beside the truth), for seconds at a time, where its matches claim
@@ -50,24 +49,26 @@ _UNKNOWN_M_S = 10.0
 """The same where the autopilot says no velocity."""
 _MAX_INTERVAL_S = 2.0
 _EVERY_S = 0.3
-"""Of faster steps some are left out: their turns are small, and each takes 5 ms of a core for four cameras."""
+"""Shortest interval; of faster steps some are left out, because their rotations are small and each takes 5 ms of a core
+for four cameras."""
 _ROUNDS = 2
-"""Each is linear about what the one before found that the body did. A third moved no number by 0.003 sigma."""
+"""Number of iterations, each linearised at the last motion of the body. A third changed no number by 0.003 sigma."""
 _FIT_GAIN = 0.1
 _MAX_MISFIT = 16.0
-"""A camera's motion whose normalised square is larger is not used: it followed something that moves."""
+"""Largest normalised square of a camera's motion that is used; a larger one followed a moving object."""
 _MAX_UNEXPECTED = 2.8
-"""The same of a motion beside what the whole flight showed: 99 % are less (chi-square with 6 degrees of freedom)."""
+"""The same against the result of the whole flight: 99 % are below (chi-square with 6 degrees of freedom)."""
 _MAX_INFLATION = 9.0
-"""A camera's errors are taken to be at most three times as large as it says."""
+"""Largest factor between a camera's errors and its own covariance."""
 _AGREEMENT_GAIN, _AGREES = 0.125, 0.5
 """Share of one motion in whether a camera's last ones agree with the body's (1) or not (-1), and from which on it does:
 after three seconds in which all did, or none. In flights with mountings up to 20 degrees off all do."""
 _MOVES_M, _MOVES_RAD = 0.2, math.radians(1.0)
-"""While the body moves and turns by less, agreement is not judged: a person who walks before a drone on the ground must
-not make a camera count as exchanged."""
+"""Least displacement and rotation of the body at which agreement is judged: a person who walks in front of a drone on
+the ground must not make a camera count as exchanged."""
 WORTH_TURN_RAD, WORTH_OFFSET_S, WORTH_FOCAL = math.radians(0.5), 0.01, 0.01
-"""Smaller differences are not worth a warning: half a degree puts a drone at 10 m by 0.09 m, and 1 % a range by 1 %."""
+"""Smallest differences that are worth a warning: half a degree moves a drone at 10 m by 0.09 m, and 1 % changes a range
+by 1 %."""
 _SURE, _SURE_OF_TURN = 16.0, 22.06
 """Squares of four standard deviations of one number, and what as few of three numbers together exceed (1 in 15,800): it
 is asked of every camera before every flight."""
@@ -81,21 +82,21 @@ squares of 16 cameras in two worlds; with real cameras more is to be expected.""
 
 @dataclass(frozen=True, eq=False)
 class CameraDeviation:
-    """How a camera differs from its configuration, by what it saw in a flight."""
+    """Deviation of a camera from its configuration, by its images in a flight."""
 
     camera: str
     turn: FloatArray
-    """(3,) rotation vector in body axes, rad, by which it is turned from where the configuration has it:
-    ``R_body_camera = exp(turn) R_configured``."""
+    """(3,) rotation vector in body axes, rad, from the configured mounting to the estimated one: ``R_body_camera =
+    exp(turn) R_configured``."""
     time_offset_s: float
-    """To be added to its time stamps, beside the rig's configured offset."""
+    """Added to its time stamps, besides the rig's configured offset."""
     focal_scale: float
-    """Its focal lengths over the configured ones."""
+    """Ratio of its focal lengths to the configured ones."""
     covariance: FloatArray
     """(5, 5) of turn, time offset, and the focal scale's logarithm."""
     elsewhere: bool = False
-    """It moves otherwise than the drone, as no small error of the mounting explains, and the other numbers say nothing:
-    turned or upside down, exchanged with another, or behind something that moves along."""
+    """Whether its motion contradicts the drone's by more than a small error of the mounting: it is on its side or
+    upside down, exchanged with another camera, or covered. The other numbers are then invalid."""
     readout_s: FloatArray | None = None
     """(2,) seconds in which rows are read one after the other, over the image's width (from its right: negative) and
     over its height; of all cameras together. Near 0: a global shutter."""
@@ -105,7 +106,7 @@ class CameraDeviation:
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What the autopilot said at a frame set's time, and each camera's own time."""
+    """The autopilot's state at the time of a frame set, and the time of each camera's image."""
 
     vehicle: VehicleState
     frames_s: float
@@ -115,7 +116,7 @@ class Seen:
 
 
 class Differs(NamedTuple):
-    """Which numbers of a camera differ from the configured ones by four standard deviations and more."""
+    """Parameters of a camera that differ from the configured ones by at least four standard deviations."""
 
     turn: bool
     time: bool
@@ -133,7 +134,7 @@ def differs(deviation: CameraDeviation) -> Differs:
 
 
 def rig_faults(deviation: CameraDeviation) -> tuple[str, ...]:
-    """What of a camera differs, by more than is worth a warning, one sentence each; for people."""
+    """Sentences about the parameters of a camera that deserve a warning, for people."""
     if deviation.elsewhere:
         return (moves_otherwise(deviation.camera),)
     sure, found = differs(deviation), []
@@ -147,7 +148,7 @@ def rig_faults(deviation: CameraDeviation) -> tuple[str, ...]:
 
 
 def described(deviation: CameraDeviation) -> str:
-    """How a camera differs from its configuration, with standard deviations, for people."""
+    """The deviation of a camera with standard deviations, for people."""
     sigma = np.sqrt(np.diag(deviation.covariance))
     turns = ", ".join(
         f"{axis} {math.degrees(angle):+.2f} +- {math.degrees(of_angle):.2f}"
@@ -178,9 +179,9 @@ class _Camera:
     offset_s: float = 0.0
     log_focal: float = 0.0
     misfit: float = 1.0
-    """How much larger its errors are than it says, squared."""
+    """Ratio of its squared errors to its own covariance."""
     agreement: float = 0.0
-    """Whether its last motions agree with the body's: 1, -1 not, 0 not known."""
+    """Agreement of its last motions with the body's: 1, contradiction -1, not known 0."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,11 +209,12 @@ class _Sight:
 
 
 class RigCalibration:
-    """The filter of one rig. Its state: of each camera the turn, time and focal length, then what all share."""
+    """The filter of one rig. Its state has the mounting, time offset and focal length of each camera, and parameters
+    common to all."""
 
     def __init__(self, rig: Rig, first: RigCalibration | None = None) -> None:
-        """``first`` has seen the same looks, and is used up: what it does not expect in the end is left out. While
-        nothing is known a camera that is wrong for a step, before the sky for example, is believed."""
+        """``first``: a filter after the same updates, which is used up. Measurements that contradict its result are
+        left out: a new filter would accept wrong ones, for example in front of the sky."""
         self._first = first
         if first is not None:
             first._wait(math.inf)  # the velocity's error was another one then
@@ -229,9 +231,9 @@ class RigCalibration:
         """Of the last update."""
 
     def update(self, before: Seen, after: Seen, pairs: PointPairs) -> None:
-        """Takes what stood still between two frame sets, which are at most some seconds apart.
+        """Takes the background pairs of two frame sets that are at most some seconds apart.
 
-        What is farther apart is left out, and so is what makes no finite numbers.
+        Pairs farther apart, and numbers that are not finite, are ignored.
         """
         interval_s = after.vehicle.time_s - before.vehicle.time_s
         if not 0.0 < interval_s <= _MAX_INTERVAL_S:
@@ -279,7 +281,7 @@ class RigCalibration:
             self._turn_variance += _TURN_GAIN * (max(jitter, _LEAST_TURN_RAD**2) - self._turn_variance)
 
     def deviations(self) -> tuple[CameraDeviation, ...]:
-        """How each camera differs from its configuration, as far as is known."""
+        """The deviation of each camera."""
         found, shared = [], np.sqrt(np.diag(self._covariance)[-_SHARED:])
         for place, (name, camera) in enumerate(self._cameras.items()):
             mine = slice(place * _SIZE, (place + 1) * _SIZE)
@@ -298,7 +300,7 @@ class RigCalibration:
         return tuple(found)
 
     def _wait(self, interval_s: float) -> None:
-        """Lets the uncertainty of the velocity's error grow with time."""
+        """Increases the uncertainty of the velocity's error with time."""
         keep = math.exp(-interval_s / _VELOCITY_TIME_S)
         kept = np.ones(len(self._covariance))
         kept[-3:] = keep
@@ -359,12 +361,12 @@ class RigCalibration:
         return J
 
     def expects(self, name: str, before: Seen, after: Seen, pairs: PointPairs) -> bool:
-        """Whether a camera moved as what is known of it now says: 99 % do."""
+        """Whether a camera's motion agrees with the current estimate; 99 % do."""
         sight = self._sight(name, before, after, pairs)
         return sight is not None and self._square(sight) < _MAX_UNEXPECTED
 
     def _square(self, sight: _Sight) -> float:
-        """How far a camera's motion is from the expected one: its normalised square."""
+        """Normalised square of the difference between a camera's motion and the expected one."""
         size, J = len(self._covariance), self._jacobian(sight, np.zeros(6))
         noise = np.diag([self._turn_variance] * 3 + [_VELOCITY_NOISE_M_S**2] * 3)
         spread = sight.camera.misfit * sight.spread + J[:, size:] @ noise @ J[:, size:].T
@@ -372,8 +374,8 @@ class RigCalibration:
         return float(sight.measured @ np.linalg.solve(spread, sight.measured)) / len(sight.measured)
 
     def _fits(self, sight: _Sight, *, moves: bool) -> bool:
-        """Whether a camera's motion is plausible; learns how large its errors are, and if the drone moves whether they
-        agree."""
+        """Whether a camera's motion is plausible. Also learns the size of its errors, and, if the drone moves, its
+        agreement."""
         camera, square = sight.camera, self._square(sight)
         if not math.isfinite(square):
             return False

@@ -1,4 +1,4 @@
-"""Chooses from many images of a board those that calibrate a camera, and says where the board should be held next."""
+"""Selects views of a board for calibration from many images, and says where the board should be held next."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ _DARK = 16
 """Grey levels: a cell that is never brighter in any image lies outside the lens's own image."""
 _ENOUGH = 0.75
 _TILT_DEG, _TILTED = 15.0, 4
-"""How many views have to be tilted by how much: only they separate the focal length from the distance."""
+"""Number of tilted views, and their least tilt: only they separate the focal length from the distance."""
 _NEAR = 0.3
 """At least one view shows a board as wide as this share of the image."""
 _PLACES = (("top left", "top", "top right"), ("left", "middle", "right"), ("bottom left", "bottom", "bottom right"))
 
 
 class Coverage:
-    """A grid over the image, with the corners that were seen in each of its cells."""
+    """A grid over the image, with the number of corners in each cell."""
 
     def __init__(self, size: tuple[int, int]) -> None:
         self.size = size
@@ -42,30 +42,30 @@ class Coverage:
         self._widest = max(self._widest, float(np.ptp(pixels, axis=0).max()) / max(self.size))
 
     def add_light(self, grey: UInt8Array) -> None:
-        """A (h, w) image, with a board or without: where it is dark the lens may show nothing at all."""
+        """Takes an image (h, w), with or without a board: cells that are always dark are outside the lens's image."""
         cells = cv2.resize(grey, (COLUMNS, ROWS), interpolation=cv2.INTER_AREA)
         self._brightest = np.maximum(self._brightest, cells)
 
     @property
     def imaged(self) -> BoolArray:
-        """(ROWS, COLUMNS) which cells the lens shows anything in."""
+        """(ROWS, COLUMNS) mask of cells in the lens's image."""
         lit: BoolArray = (self._brightest > _DARK) | (self.counts > 0)
         return lit
 
     @property
     def share(self) -> float:
-        """0 to 1: cells with a corner, of those that the lens shows anything in."""
+        """Share of the cells in the lens's image that have a corner, 0 to 1."""
         cells = int(self.imaged.sum())
         return float((self.counts > 0).sum()) / cells if cells else 0.0
 
     @property
     def text(self) -> tuple[str, ...]:
-        """The grid as lines of characters: full where corners were seen, dots where none, blank outside the lens."""
+        """The grid as lines of characters: full with corners, dots without, blank outside the lens's image."""
         signs = np.where(self.counts > 0, "##", np.where(self.imaged, "..", "  "))
         return tuple(" ".join(row) for row in signs)
 
     def advice(self, tilts_deg: Sequence[float]) -> tuple[str, ...]:
-        """What is still missing, each in one sentence, the worst first; ``tilts_deg``: of the board in each view."""
+        """Sentences about what is still missing, the worst first; ``tilts_deg``: tilt of the board in each view."""
         found = []
         tilted = sum(tilt > _TILT_DEG for tilt in tilts_deg)
         if tilted < _TILTED:
@@ -93,15 +93,15 @@ class Coverage:
 
 Refusal = Literal["no board", "blurred", "moving", "like another"]
 MOST_VIEWS = 100
-"""Further ones count as duplicates: this many different views are enough."""
+"""Largest number of views; further ones count as duplicates."""
 _SHARP_PX, _SHARP_SHARE = 4.0, 0.003
-"""Widest edge of a sharp view: so many pixels, or this share of a large image's width."""
+"""Widest edge of a sharp view, in pixels, or as a share of a large image's width."""
 _ALIKE = 0.03
 """Two views whose corners differ by less than this share of the image's width, on average, are duplicates."""
 _STILL = 0.003
-"""The same, of a board that is held still from one frame to the next."""
+"""The same for a board that is held still between two frames."""
 _SAME = 0.6
-"""Views that have a smaller share of their corners in common show different parts of the board."""
+"""Share of common corners below which two views show different parts of the board."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +126,7 @@ class Refused:
 
 
 class Collector:
-    """Takes images of one camera one after the other. All are of one size: another is a CalibrationError."""
+    """Takes images of one camera one after the other. Raises CalibrationError for an image of another size."""
 
     def __init__(self, finder: BoardFinder) -> None:
         self._finder = finder
@@ -139,9 +139,9 @@ class Collector:
         self.coverage: Coverage | None = None
 
     def offer(self, name: str, image: UInt8Array, *, moving: bool = False) -> Refusal | None:
-        """Takes a (h, w, 3) RGB image; gives the reason why it is refused; None: it is now a view.
+        """Takes an RGB image (h, w, 3). Returns why it is refused; None: it is a new view.
 
-        ``moving``: images follow each other so fast that a board in motion shows between them.
+        ``moving``: images of a live camera, in which a board that is moved must be refused.
         """
         self._check_size(name, (image.shape[1], image.shape[0]))
         assert self.coverage is not None
@@ -165,11 +165,11 @@ class Collector:
         return None
 
     def found_instead(self) -> str:
-        """What the last image without a board shows, for people."""
+        """Description of the last image without a board, for people."""
         return self._finder.found_instead()
 
     def counts(self) -> dict[Refusal, int]:
-        """How many were refused, by reason."""
+        """Number of refused images, by reason."""
         return dict(Counter(refused.why for refused in self.refused))
 
     def _check_size(self, name: str, size: tuple[int, int]) -> None:
@@ -187,7 +187,7 @@ class Collector:
 
 
 def _apart(first: BoardDetection, second: BoardDetection, width: int) -> float:
-    """Mean distance of the corners that both show, as a share of the width; infinite where they show others."""
+    """Mean distance of common corners, as a share of the width; infinite if few are common."""
     _, a, b = np.intersect1d(first.ids, second.ids, assume_unique=True, return_indices=True)
     if len(a) < _SAME * max(len(first.ids), len(second.ids)):
         return float("inf")
@@ -195,7 +195,7 @@ def _apart(first: BoardDetection, second: BoardDetection, width: int) -> float:
 
 
 _SMALLEST_SQUARE_PX = 10.0
-"""Across smaller squares there is no room to measure an edge."""
+"""Smallest square across which an edge can be measured."""
 _ACROSS, _STEP_PX = 0.35, 0.25
 """How far a profile goes to both sides, in squares, and how fine it is."""
 _ALONG = np.linspace(-0.2, 0.2, 7)
@@ -203,10 +203,10 @@ _ALONG = np.linspace(-0.2, 0.2, 7)
 
 
 def edge_width_px(grey: UInt8Array, seen: BoardDetection, columns: int) -> float:
-    """Pixels over which black becomes white, in the direction in which the view is blurred more.
+    """Width in pixels of an edge between black and white, in the direction in which the view is blurred more.
 
-    Of a perfectly sharp image it is between 1 and 2; of one blurred with a deviation of s pixels about 2.5 s. NaN
-    where the board, of so many columns of squares, is too small to tell.
+    It is between 1 and 2 for a perfectly sharp image, and about 2.5 s for a blur of standard deviation s pixels. NaN:
+    the board, with this many columns of squares, is too small in the image.
     """
     corners = columns - 1
     places = dict(zip(seen.ids.tolist(), seen.pixels, strict=True))

@@ -1,1 +1,1 @@
-"""Cameras before a flight: which are plugged in, what they give, and the configuration that names them."""
+"""Cameras before a flight: a list, measurements, and their configuration."""

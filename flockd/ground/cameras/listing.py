@@ -1,4 +1,4 @@
-"""Which cameras are plugged in, what they offer, and how flockd would run them: the kernel's, and GStreamer's."""
+"""Lists the cameras of this computer, V4L2's and GStreamer's, with their modes and the configuration for them."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from flockd.onboard.sources.v4l2_kernel import (
 )
 
 USUAL_SIZE, USUAL_RATE_HZ = (640, 480), 30.0
-"""What is chosen where a camera offers it."""
+"""Preferred size and rate."""
 _PREFERENCE = ("mjpeg", "NV12", "yuyv")
 """Formats in order of preference, first those that take the least of a bus."""
 
@@ -67,11 +67,11 @@ class FoundCamera:
     name: str
     """Its driver's or maker's."""
     node: str
-    """What the kernel calls it now, such as /dev/video0; empty where that is not known."""
+    """Its node at present, such as /dev/video0; empty: not known."""
     device: str = ""
-    """The path to configure, which stays the same; of a V4L2 camera."""
+    """For a V4L2 camera: the path to configure, which stays the same."""
     element: str = ""
-    """GStreamer's, with its properties; of a camera that flockd reads by a pipeline."""
+    """For a camera that flockd reads through GStreamer: the element with its properties."""
     modes: tuple[Mode, ...] = ()
     controls: tuple[ControlRange, ...] = ()
     fault: str | None = None
@@ -96,7 +96,7 @@ class FoundCamera:
         return replace(best, rates_hz=(max(usual, default=min(best.rates_hz, default=USUAL_RATE_HZ)),))
 
     def parameters(self, name: str, mode: Mode, *, as_pipeline: bool = False) -> CameraDeviceParameters:
-        """How flockd runs it in a mode, under a name of the rig; ``as_pipeline``: through GStreamer in any case."""
+        """Its configuration for a mode and a name in the rig; ``as_pipeline``: always through GStreamer."""
         rate_hz = mode.rates_hz[0]
         if self.element or as_pipeline:
             kind = _PIPELINE_CAPS[mode.pixel_format]
@@ -113,7 +113,7 @@ class FoundCamera:
 
 
 BY_PATH = Path("/dev/v4l/by-path")
-"""udev's links by the socket that a camera is plugged into: they stay the same whatever is plugged in elsewhere."""
+"""udev's links by the socket of a camera, which do not depend on other devices."""
 RUN_S = 20.0
 _ARGUS = "nvarguscamerasrc"
 _SIZES_OF_RANGE = ((640, 480), (1280, 720), (1920, 1080))
@@ -123,7 +123,7 @@ _SCALED = tuple(Mode("NV12", size, (30.0,)) for size in _SIZES_OF_RANGE)
 
 
 def run_program(command: Sequence[str]) -> str | None:
-    """What a program prints; None where it is not installed, fails or takes too long."""
+    """The output of a program; None: it is not installed, fails or takes too long."""
     try:
         done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=RUN_S, check=False)
     except (OSError, subprocess.TimeoutExpired):
@@ -133,7 +133,7 @@ def run_program(command: Sequence[str]) -> str | None:
 
 @dataclass(frozen=True)
 class Computer:
-    """Where cameras are looked for."""
+    """The parts of the system in which cameras are searched; tests replace them."""
 
     kernel: Kernel = field(default_factory=Kernel)
     nodes: Path = Path("/sys/class/video4linux")
@@ -142,7 +142,7 @@ class Computer:
 
 
 def list_cameras(computer: Computer) -> list[FoundCamera]:
-    """All of them, in a stable order; one that cannot be used says why."""
+    """All cameras in a stable order; an unusable one says why."""
     found = list(_of_kernel(computer))
     monitored = list(_of_monitor(computer.run(MONITOR) or ""))
     if any(camera.fault == SENSOR_ONLY for camera in found) and computer.run(("gst-inspect-1.0", "--exists", _ARGUS)):
@@ -153,7 +153,7 @@ def list_cameras(computer: Computer) -> list[FoundCamera]:
 
 
 def _of_kernel(computer: Computer) -> Iterator[FoundCamera]:
-    """Each by the shortest of its links, as udev has more than one for a USB 2 socket."""
+    """V4L2 cameras, each by its shortest link: udev has several for a USB 2 socket."""
     links: dict[str, str] = {}
     for link in sorted(computer.links.glob("*"), key=lambda link: (len(link.name), link.name)):
         if link.is_symlink():
@@ -166,7 +166,7 @@ def _of_kernel(computer: Computer) -> Iterator[FoundCamera]:
 
 
 def _by_argus(found: Sequence[FoundCamera]) -> Iterator[FoundCamera]:
-    """On a Jetson the sensors of the CSI ports are cameras of NVIDIA's, numbered in the kernel's order."""
+    """On a Jetson, sensors of the CSI ports as NVIDIA's cameras, numbered in the kernel's order."""
     number = 0
     for camera in found:
         if camera.fault == SENSOR_ONLY:
@@ -179,7 +179,7 @@ def _by_argus(found: Sequence[FoundCamera]) -> Iterator[FoundCamera]:
 
 MONITOR = ("gst-device-monitor-1.0", "Video/Source")
 _OTHERS = ("v4l2src", "pipewiresrc", "ximagesrc")
-"""Elements that are left out: what flockd finds by itself, and what is a view of it or no camera."""
+"""Elements that are left out: cameras that flockd finds itself, and elements that are no camera."""
 _LAUNCH = re.compile(r"^\s*gst-launch-1\.0 (\S.*?)(?: ! \.\.\.)?\s*$", re.MULTILINE)
 _NAME = re.compile(r"^\s*name\s*: (.*)$", re.MULTILINE)
 
@@ -203,7 +203,7 @@ _Entry = TypeVar("_Entry", FormatDescription, FrameSize, FrameInterval)
 
 
 def read_camera(kernel: Kernel, node: str, device: str) -> FoundCamera | None:
-    """The camera at a node, whose path to configure is ``device``; None for what captures no images."""
+    """The camera at a node, whose path to configure is ``device``; None: it captures no images."""
     try:
         descriptor = kernel.open(node)
     except OSError as error:
@@ -252,7 +252,7 @@ def _kernel_modes(kernel: Kernel, descriptor: int, number: int) -> Iterator[Mode
 
 
 def _entries(kernel: Kernel, descriptor: int, request: int, entry: Callable[..., _Entry]) -> Iterator[_Entry]:
-    """A list of the driver's, by index, until it ends or the driver breaks its own rules."""
+    """Entries of a driver's list by index, until it ends or the driver returns an error."""
     for index in range(_MOST):
         asked = entry(index=index)
         try:
@@ -322,8 +322,8 @@ def camera_names(count: int) -> Sequence[str]:
 
 
 def _evenly(number: int, count: int, name: str, size: tuple[int, int]) -> CameraConfig:
-    """One of the cameras that look evenly around, with perfect wide-angle lenses; the field of view is that of the
-    longer side."""
+    """One of the cameras at equal angles around the drone, with ideal wide-angle lenses; the field of view is that of
+    the longer side."""
     width, height = size
     yaw_deg = 360.0 * number / count
     forward_m, right_m = (round(0.1 * of(math.radians(yaw_deg)), 2) + 0.0 for of in (math.cos, math.sin))  # no -0.0

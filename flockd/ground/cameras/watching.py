@@ -1,4 +1,4 @@
-"""Watches cameras: runs them side by side for some seconds, as a source does in flight, and writes down what came."""
+"""Runs all cameras for some seconds, as a source does in flight, and measures their images."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from flockd.onboard.sources.shared_memory import SharedMemorySource
 from flockd.onboard.sources.v4l2_kernel import Kernel
 
 START_S = 10.0
-"""To open any device, or to find another program, and to get the first image."""
+"""Time to open a device, or to find another program, and to get the first image."""
 _LOOK_S = 0.05
 _REFUSED: Mapping[Count, str] = {
     "flagged": "damaged, as the driver reports",
@@ -36,12 +36,12 @@ _REFUSED: Mapping[Count, str] = {
 
 @dataclass
 class Watched:
-    """What one camera did."""
+    """Measurements of one camera."""
 
     fault: str | None = None
-    """Why it gives nothing, in one sentence that ends in its fix."""
+    """Why it gives no images: one sentence that ends with the remedy."""
     stamps_s: list[float] = field(default_factory=list)
-    """When each image was taken, as its time stamp says."""
+    """Time stamp of each image."""
     lost: int = 0
     """Gaps in the sequence numbers."""
     refused: Counter[str] = field(default_factory=Counter)
@@ -57,7 +57,7 @@ class Watched:
         return (len(self.stamps_s) - 1) / max(self.stamps_s[-1] - self.stamps_s[0], 1e-9)
 
     def jitter_s(self) -> float:
-        """95th percentile of how far an interval is from the nearest multiple of the usual one."""
+        """95th percentile of the difference between an interval and the nearest multiple of the usual one."""
         intervals = np.diff(self.stamps_s)
         if len(intervals) < 2:
             return 0.0
@@ -73,10 +73,10 @@ def watch(
     devices: Devices,
     start_s: float = START_S,
 ) -> dict[str, Watched]:
-    """Runs all cameras of a source side by side, as a USB bus has to carry them in flight; ``sizes`` by camera.
+    """Runs all cameras of a source at the same time, as in flight; ``sizes``: width and height by camera.
 
     Each is watched for ``seconds`` from its first image on, which has to come within ``start_s``. Raises
-    UnavailableError for an endpoint that cannot be one.
+    UnavailableError for an invalid endpoint.
     """
     watched = {name: Watched() for name in sizes}
     last: dict[str, RawFrame] = {}
@@ -138,13 +138,13 @@ def _conclude(record: Watched, status: CameraStatus, last: RawFrame | None, sile
 
 
 _NEIGHBOURHOOD_PX = 25
-"""Across which an edge's contrast is taken; of edges blurred by more, too little is seen."""
+"""Distance in pixels across which an edge's contrast is measured."""
 _STEEPEST = 0.5
-"""Per cent of an image's pixels that are looked at: where its edges are."""
+"""Percentage of an image's pixels, the steepest ones, that count as edges."""
 _LEAST_CONTRAST = 30.0
 """Grey levels; a weaker edge has more noise than slope."""
 _SILENCE_S = 3.0
-"""A camera without an image for this long is opened again: longer than any camera's interval."""
+"""Time without an image after which a camera is opened again; longer than any camera's interval."""
 
 
 def measure(cameras: Sequence[tuple[FoundCamera, Mode]], seconds: float, kernel: Kernel) -> list[Watched]:
@@ -156,10 +156,10 @@ def measure(cameras: Sequence[tuple[FoundCamera, Mode]], seconds: float, kernel:
 
 
 def edge_width_px(image: UInt8Array) -> float:
-    """Pixels over which the sharpest edges of a scene go from dark to bright: contrast over steepest slope.
+    """Width in pixels of the sharpest edges of a scene: contrast over steepest slope.
 
-    ``image``: (h, w, 3) RGB of anything that has edges. Of a sharp image it is between 1.5 and 3; blurred with a
-    deviation of s pixels about 2.5 s. NaN where nothing has enough contrast.
+    ``image``: (h, w, 3) RGB of a scene with edges. The width is between 1.5 and 3 for a sharp image, and about 2.5 s
+    for a blur of standard deviation s pixels. NaN: no edge has enough contrast.
     """
     grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.float32)
     slope = np.hypot(cv2.Scharr(grey, cv2.CV_32F, 1, 0), cv2.Scharr(grey, cv2.CV_32F, 0, 1)) / 32.0

@@ -1,1 +1,1 @@
-"""Images that others took with real cameras, in folders with depth and poses: read, and flown again."""
+"""Datasets of real cameras, in folders with depth and poses, for replay."""

@@ -1,4 +1,4 @@
-"""Image and depth files, whole or not at all: a decoder would fill in what is missing."""
+"""Reads image and depth files, and refuses incomplete ones, in which a decoder would fill in missing data."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ UNREAD_SUFFIXES = frozenset(
     {".heic", ".heif", ".jxl", ".jp2", ".gif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"}
     | {".3gp", ".mts", ".ts", ".wmv", ".flv", ".insv"}
 )
-"""Pictures and videos that are not read: a folder's are named."""
+"""Kinds of pictures and videos that are not read; those of a folder are reported."""
 _WITH_PAGES = frozenset({".tif", ".tiff", ".webp", ".avif"})
 _PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND"
 _JPEG = b"\xff\xd8"
 MAX_FILE_BYTES = 1 << 29
-"""Largest file: an image with the most pixels that are read and a depth of 16 bits, uncompressed, and some more."""
+"""Largest file: an uncompressed image of the largest permitted size with 16 bits, and some reserve."""
 _CHUNK_FRAME = 12
 """Bytes of a PNG chunk beside its data: length, name and checksum."""
 
 
 def unread(files: Iterable[Path]) -> str | None:
-    """What of these are pictures or videos that are not read, in a sentence, by kind; None: none."""
+    """A sentence about the pictures and videos among these that are not read, by kind; None: all are read."""
     counts = Counter(suffix for file in files if (suffix := file.suffix.lower()) in UNREAD_SUFFIXES)
     kinds = ", ".join(f"{count} {suffix}" for suffix, count in sorted(counts.items()))
     return (
@@ -49,7 +49,7 @@ def unread(files: Iterable[Path]) -> str | None:
 
 
 def in_order(files: Iterable[Path]) -> list[Path]:
-    """By their names, in which numbers count as such: `frame2` comes before `frame10`."""
+    """Sorts by name, with numbers as numbers: `frame2` comes before `frame10`."""
 
     def parts(file: Path) -> list[tuple[str, Decimal]]:
         found = re.findall(r"(\D*)(\d*(?:(?<=\d)\.\d+)?)", str(file.with_suffix("")))
@@ -74,7 +74,7 @@ def read_image(path: Path, size: tuple[int, int] | None = None) -> UInt8Array:
 
 
 def read_depth(path: Path, size: tuple[int, int], units_per_m: float) -> Float32Array:
-    """(h, w) metres, NaN where the file has 0. Raises DatasetError, also for a file that has 0 everywhere."""
+    """(h, w) metres, NaN for 0 in the file. Raises DatasetError, also for a file of zeros only."""
     raw = _decoded(path, cv2.IMREAD_UNCHANGED)
     if raw.dtype != np.uint16 or raw.ndim != 2:
         raise DatasetError(f"{path}: is not a depth map; it needs one channel of 16 bits")
@@ -121,11 +121,11 @@ _OTHERS = {
     **dict.fromkeys((b"\x1f\x8b", b"PK\x03\x04", b"\x28\xb5\x2f\xfd"), "is packed; unpack it"),
     **dict.fromkeys((b"%PDF", b"<svg", b"<?xml"), "is a document; save its picture as PNG"),
 }
-"""How files begin that have an image's name and are none."""
+"""First bytes of files with an image's name that are no image."""
 
 
 def _fault(data: bytes) -> str | None:
-    """What is wrong with a file before it is decoded, and memory taken for what it claims to hold."""
+    """The fault of a file, found before it is decoded and memory is taken for its claimed size."""
     if not data:
         return "is empty"
     if (costs := cost_fault(data)) is not None:
@@ -144,7 +144,7 @@ def _pages_fault(path: Path) -> str | None:
 
 @contextmanager
 def _stderr_of_libraries() -> Iterator[Callable[[], str]]:
-    """What decoders write there meanwhile. libjpeg says only there that it has filled in what is damaged."""
+    """Captures what decoders write to standard error: only there libjpeg reports that it has filled in damaged data."""
     with TemporaryFile() as said:
         before = os.dup(2)
         os.dup2(said.fileno(), 2)
@@ -202,7 +202,7 @@ def opened_video(path: Path) -> Iterator[cv2.VideoCapture]:
 
 
 _MISSING = 0.02
-"""Share of its frames that a video may lack: containers count some that are not shown."""
+"""Share of its frames that a video may lack: some containers count frames that are not shown."""
 
 
 def images_of_video(path: Path, every: int = 1) -> Iterator[tuple[int, float, UInt8Array]]:

@@ -1,4 +1,4 @@
-"""A folder of one camera's images, with their depth maps and poses where those are known.
+"""A folder with images of one camera, and optional depth maps and poses.
 
 The files of `images/` and of `depth/` in order of the numbers in their names; in `poses.txt` a 4x4 camera-to-world
 matrix a line; and in `K.txt` the camera's matrix.
@@ -22,10 +22,10 @@ from flockd.ground.datasets.image_files import SUFFIXES, DatasetError, in_order,
 _UNITS_PER_M = 1000.0
 """Of depth maps, 16 bits a pixel."""
 _ROUNDING = 1e-2
-"""How far from a rotation a matrix of rounded numbers may be."""
+"""Largest deviation of a matrix of rounded numbers from a rotation."""
 
 CAMERA = "camera"
-"""Its name where the file has none."""
+"""Name of the camera."""
 _HALF_PIXEL = 0.5
 """Other people's matrices count pixel centres from 0; ours lie at +0.5."""
 MAX_TABLE_BYTES = 1 << 28
@@ -34,14 +34,14 @@ MAX_TABLE_BYTES = 1 << 28
 
 @dataclass(frozen=True, eq=False)
 class DatasetFrame:
-    """Where an image was taken, and the files of it."""
+    """The pose and the files of one image."""
 
     index: int
     """Counted from 0 at the dataset's first frame."""
     image: Path
     depth: Path | None
     T_world_camera: RigidTransform | None
-    """From optical RDF to the dataset's world; None where it is not known."""
+    """From optical RDF to the dataset's world; None: not known."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +50,7 @@ class Dataset:
 
     path: Path
     camera: CameraConfig
-    """The one that took it; pixel centres at +0.5."""
+    """The camera; pixel centres at +0.5."""
     moments: tuple[DatasetFrame, ...]
 
     @property
@@ -62,8 +62,8 @@ class Dataset:
         return len(self.moments)
 
     def frames(self, *, with_depth: bool) -> Iterator[tuple[DatasetFrame, UInt8Array, ZMap | None]]:
-        """All in order, read one by one: (h, w, 3) RGB, and (h, w) metres along the optical axis, NaN where there are
-        none; None where they were not asked for. Raises DatasetError at a file that is missing or damaged."""
+        """Reads all in order, one by one: images (h, w, 3) RGB, and depth (h, w) metres along the optical axis, NaN
+        where unknown; None if not requested. Raises DatasetError at a missing or damaged file."""
         size = self.camera.size_px
         for one in self.moments:
             depth = ZMap(read_depth(one.depth, size, _UNITS_PER_M)) if with_depth and one.depth else None
@@ -91,7 +91,7 @@ def _files(folder: Path) -> list[Path]:
 
 
 def _depth(folder: Path, images: Sequence[Path]) -> Sequence[Path | None]:
-    """Checked against the images both ways: a file too many may belong to an image that is gone."""
+    """The depth maps, one for each image: an extra map may belong to a missing image."""
     if not folder.is_dir():
         return [None] * len(images)
     maps = {file.stem: file for file in _files(folder)}

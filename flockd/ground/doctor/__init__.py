@@ -1,5 +1,5 @@
-"""Examines a drone on the ground: each check says what it measured, how well that is, and how to fix it. Each is
-bounded in time: one that hangs or breaks is a failure."""
+"""Examines a drone on the ground. Each check gives its measurement, a level and the remedy. Its time is bounded: a
+check that hangs or raises is a failure."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 
 
 class Level(StrEnum):
-    """How well it is."""
+    """The level of a finding."""
 
     PASS = "PASS"
     WARNING = "WARNING"
-    """It flies, but not as well or as safely as it could, or the check could not tell."""
+    """The drone can fly, but less well or less safely than it could; or the check has no result."""
     FAILURE = "FAILURE"
     """Do not fly."""
 
@@ -34,36 +34,36 @@ class Finding:
 
     level: Level
     about: str
-    """Which camera, model, parameter ..."""
+    """Name of the camera, model, parameter or other thing."""
     measured: str
     fix: str
-    """What to do; empty where nothing is to be done."""
+    """The remedy; empty: none is needed."""
 
 
 def passed(about: str, measured: str) -> Finding:
-    """All is well."""
+    """A finding of level PASS."""
     return Finding(Level.PASS, about, measured, "")
 
 
 def warned(about: str, measured: str, fix: str) -> Finding:
-    """It could be better."""
+    """A finding of level WARNING."""
     return Finding(Level.WARNING, about, measured, fix)
 
 
 def failed(about: str, measured: str, fix: str) -> Finding:
-    """It must not be like this."""
+    """A finding of level FAILURE."""
     return Finding(Level.FAILURE, about, measured, fix)
 
 
 def graded(about: str, measured: str, fix: str, *, failure: bool = False, warning: bool = False) -> Finding:
-    """Failed or warned where one of these holds, the worse first; else passed."""
+    """FAILURE or WARNING if its fault is given, the worse first; else PASS."""
     if failure or warning:
         return Finding(Level.FAILURE if failure else Level.WARNING, about, measured, fix)
     return passed(about, measured)
 
 
 def failed_from_error(about: str, sentence: str) -> Finding:
-    """The failure that an error's sentence describes: our sentences end in what to do, after the last semicolon."""
+    """The failure of an error: its sentence ends with the remedy, after the last semicolon."""
     measured, _, fix = sentence.rpartition("; ")
     return failed(about, measured or fix, fix if measured else "correct it, and run `flockd doctor` again")
 
@@ -81,11 +81,11 @@ _LIMITS_S = {
     "cameras": 20.0,
     "models": 180.0,
 }
-"""How long each may take, the cameras beside what they are watched. Memory before the models are loaded, and those
-last, as they heat up the computer."""
+"""Time limit of each check, for cameras besides the time they are watched. Memory comes before the models are loaded,
+and models come last, because they heat up the computer."""
 CHECKS = tuple(_LIMITS_S)
 BESIDE_A_FLIGHT = frozenset({"limits", "instance", "memory", "disk", "temperature", "clock"})
-"""Checks that leave alone what a drone flies with: its autopilot, cameras and endpoints, and its computer's time."""
+"""Checks that do not touch a running daemon's autopilot, cameras, endpoints and processor time."""
 
 
 @dataclass(frozen=True)
@@ -94,23 +94,23 @@ class Check:
 
     name: str
     run: Callable[[], Iterable[Finding]]
-    """Changes nothing; what it finds counts even if it hangs later."""
+    """Runs the check, which changes nothing; its findings count even if it hangs later."""
     limit_s: float
-    """Much longer than the check should take."""
+    """Time limit, well above the usual duration."""
 
 
 @dataclass(frozen=True)
 class Examined:
-    """A drone, and what its checks need to know."""
+    """The drone, and the parameters of the checks."""
 
     config: DroneConfig
     recordings: Path | None
-    """Where flights are recorded; None: in the service's folder, where there is one."""
+    """Folder of recordings; None: that of the service, if it exists."""
     seconds: float
-    """How long the cameras are watched."""
+    """Time for which the cameras are watched."""
     taken: UnavailableError | None
-    """Why this process may not own the drone's link; None: it owns it. Without it, whatever would touch the drone is
-    not examined."""
+    """Why this process does not own the drone's link; None: it does. Otherwise checks that touch the drone are
+    skipped."""
 
 
 def plan(drone: Examined, only: Collection[str] = CHECKS) -> tuple[Check, ...]:
@@ -123,7 +123,7 @@ def plan(drone: Examined, only: Collection[str] = CHECKS) -> tuple[Check, ...]:
 
 
 def _check(name: str, drone: Examined) -> Iterable[Finding]:
-    """Imports what checks only when it runs: a library that does not load fails its check alone."""
+    """Imports the check when it runs, so that a library that does not load fails this check only."""
     config = drone.config
     if drone.taken is not None and name not in BESIDE_A_FLIGHT:
         fix = "see `instance`, and examine again once that process has ended"
@@ -159,7 +159,7 @@ def _check(name: str, drone: Examined) -> Iterable[Finding]:
 
 
 def run_checks(checks: Sequence[Check], on_done: Callable[[int, int], None]) -> dict[str, tuple[Finding, ...]]:
-    """What each check found, by its name; ``on_done`` is called with how many of how many are done."""
+    """The findings of each check, by name; ``on_done`` is called with the number of checks done and their total."""
     found = {}
     for number, check in enumerate(checks, start=1):
         found[check.name] = _bounded(check)
@@ -187,7 +187,7 @@ def _bounded(check: Check) -> tuple[Finding, ...]:
 
 
 def _of_error(about: str, error: BaseException) -> Finding:
-    """The failure that an error means."""
+    """The failure for an exception."""
     match error:
         case FlockdError():
             return failed_from_error(about, str(error))

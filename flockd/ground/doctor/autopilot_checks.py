@@ -1,4 +1,4 @@
-"""The autopilot: connected, of a known version, and set up to act when setpoints stop. Nothing here changes it."""
+"""Checks the autopilot: link, firmware, and parameters that make it act when setpoints stop. Changes nothing."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from flockd.onboard.autopilot.refusals import Refusal
 
 HEARD_S = 10.0
 CLOCK_S = 1.0
-"""For exchanges of times with it."""
+"""Time for clock exchanges."""
 CHECKS_S = 2.0
-"""For the autopilot to run its checks and to tell them."""
+"""Time for the autopilot to run and report its checks."""
 OLDEST_TRIED = (1, 14)
 """Before PX4 1.14, COM_OBL_RC_ACT held only with a remote control, and COM_OBL_ACT without."""
 LONGEST_LOSS_S = 1.0
 
 RANGE_FINDER = "range finder"
 WATCHED_S = 1.5
-"""How long its messages are watched."""
+"""Time for which its messages are watched."""
 LEAST_RATE_HZ = 10.0
 NEAREST_M = 0.5
-"""A sensor that measures nothing nearer is blind at take-off and landing."""
+"""Largest permitted shortest range: a sensor with a larger one is blind at take-off and landing."""
 
 PARAMETERS: dict[str, type[int] | type[float]] = {
     "COM_OF_LOSS_T": float,
@@ -44,19 +44,19 @@ PARAMETERS: dict[str, type[int] | type[float]] = {
     "GF_MAX_VER_DIST": float,
     "CP_DIST": float,
 }
-"""Those of PX4 that are judged, each as PX4 declares it."""
+"""PX4's parameters that are checked, with their types in PX4."""
 
 
 class ParameterChoice(NamedTuple):
-    """A parameter that says what PX4 does in some case."""
+    """A parameter that chooses PX4's action in some case."""
 
     when: str
     words: Mapping[int, str]
     """PX4's values."""
     good: tuple[int, int, int]
-    """Those that a drone may have, the best first."""
+    """Permitted values, the best first."""
     poor: tuple[int, ...] | None = None
-    """Values with which it may fly, but not well; None: all others. With any other value it must not fly."""
+    """Values that are a warning; None: all others. Any other value is a failure."""
 
 
 ACTIONS = {
@@ -97,7 +97,7 @@ ACTIONS = {
 
 
 def check_autopilot(config: DroneConfig, heard_s: float = HEARD_S) -> Iterator[Finding]:
-    """All of it, over a link of its own, to an autopilot that is heard within ``heard_s``."""
+    """Runs all checks over a separate link to an autopilot that is heard within ``heard_s``."""
     if config.autopilot is None:
         measured = "the configuration has no `autopilot`: this drone can be simulated but not flown"
         yield warned("autopilot", measured, "add `autopilot` with the `address` of the autopilot")
@@ -165,7 +165,7 @@ def _is_silent(status: AutopilotStatus, config: DroneConfig) -> bool:
 
 
 def judge_heartbeat(system_id: int, status: AutopilotStatus, config: DroneConfig) -> Finding:
-    """Heard, and on the ground."""
+    """Whether it is heard, and on the ground."""
     address = "" if config.autopilot is None else f" at {config.autopilot.address}"
     measured = f"system {system_id}{address}, heard {status.heartbeat_age_s:.1f} s ago"
     if _is_silent(status, config):
@@ -184,7 +184,7 @@ def judge_refusals(refusals: Sequence[Refusal]) -> list[Finding]:
 
 
 def judge_clock(clock: ClockEstimate | None) -> Finding:
-    """Whether its stamps can be placed on this computer's clock."""
+    """Whether its time stamps can be converted to this computer's clock."""
     if clock is None:
         measured = "it does not answer TIMESYNC, or its stamps contradict it: attitudes count from when they arrive"
         return warned("clock", measured, "update the firmware, and check whether the link loses messages")
@@ -195,7 +195,7 @@ def judge_clock(clock: ClockEstimate | None) -> Finding:
 
 
 def judge_firmware(firmware: Firmware) -> Finding:
-    """Whether it is one whose modes and failsafes flockd knows."""
+    """Whether flockd knows the modes and failsafes of this firmware."""
     measured = f"{firmware.autopilot} {firmware.version}"
     if firmware.autopilot != "PX4":
         return failed("firmware", f"{measured} has other flight modes and failsafes", "flash PX4")
@@ -248,7 +248,7 @@ def _judge_action(name: str, action: ParameterChoice, value: int, config: DroneC
 
 
 def _judge_limit(name: str, value: float, own_m: float | None, what: str) -> Finding:
-    """PX4's limit should lie a little outside flockd's own, as a second line."""
+    """PX4's limit should be a little larger than flockd's, as a second line of defence."""
     outside = "where it must never fly" if own_m is None else f"{1.2 * own_m:.0f} m, a little outside flockd's own"
     if value <= 0:
         return warned(name, f"{value:g}: PX4's fence has no such limit", f"set {name} to {outside}")
@@ -260,7 +260,7 @@ def _judge_limit(name: str, value: float, own_m: float | None, what: str) -> Fin
 
 
 def judge_range_finder(reading: RangeReading | None, arrivals_s: Sequence[float], config: DroneConfig) -> Finding:
-    """The newest of the sensor that faces down, of a drone on the ground; ``arrivals_s``: of its last readings."""
+    """The newest reading of the range finder that faces down; ``arrivals_s``: arrival times of the last readings."""
     if reading is None:
         blame = failed if config.perception.height == "range_finder" else warned
         fix = "see to the sensor, its driver and orientation (downward) in PX4, or write perception.height: barometer"

@@ -1,4 +1,4 @@
-"""Cameras: run all at once and watched for some seconds, their calibrations, the rig, and what the last flight saw."""
+"""Checks cameras: all run at once for some seconds; their calibrations; the rig, also by the last flight."""
 
 from __future__ import annotations
 
@@ -25,28 +25,28 @@ from flockd.onboard.sources.device_source import Devices
 SLOW, TOO_SLOW = 0.95, 0.8
 """Shares of the configured rate. Cheap cameras halve theirs by themselves in dim light."""
 UNEVEN, TOO_UNEVEN = 0.2, 0.5
-"""Shares of a frame period: 95th percentile of how far a frame is from its beat. By half a period sets fall apart."""
+"""Limits of the jitter (95th percentile) as shares of a frame period; at half a period sets become incomplete."""
 FIX_RATE = "try another cable and port, fewer cameras on one USB bus, or a shorter exposure that is set by hand"
 FIX_PIPELINE = "try the pipeline with `gst-launch-1.0`, and ask it for a rate and size that it can keep"
 DARK, BRIGHT = 12.0, 243.0
-"""Mean grey, 0 to 255, of an image in which little can be seen."""
+"""Mean grey levels, 0 to 255, below and above which an image is too dark or too bright."""
 
 ODD_CENTRE = 0.08
 """Share of the width or height between principal point and middle. Real lenses sit within some percent of it."""
 ODD_PIXELS = 0.03
 """How much fx and fy differ: pixels are square, unless images were squeezed from another aspect."""
 SEEN_DEG, UNSEEN = 63, 0.12
-"""How far off the axis networks were trained (docs/networks.md), and which share of an image may lie beyond: a tenth of
-those of the shipped rig is."""
+"""Largest angle from the optical axis in the networks' training (docs/networks.md), and the share of an image that may
+lie beyond it; in the shipped rig it is a tenth."""
 LAST_S = 30.0
-"""Of the last flight, that the rig is compared with: computed again, they take less time than they took in the air."""
+"""Seconds of the last flight that are computed again and compared with the rig."""
 NARROW_DEG = 40.0
 
 
 def check_cameras(
     config: DroneConfig, seconds: float, devices: Devices | None = None, start_s: float = START_S
 ) -> Iterator[Finding]:
-    """Every camera of the rig, and what they see together."""
+    """Checks every camera of the rig, and their common view."""
     source = config.source
     if source is None:
         measured = "the configuration has no `source`: this drone can be simulated but not flown"
@@ -88,7 +88,7 @@ def _judged(camera: CameraConfig, config: DroneConfig, watched: Watched | None) 
 
 
 def _stream(name: str, watched: Watched, rate_hz: float, max_dropped_share: float, fix_rate: str) -> Iterator[Finding]:
-    """Of the images that came; ``fix_rate``: what to do about too few, uneven or damaged ones."""
+    """Checks a camera's images; ``fix_rate``: the remedy for too few, uneven or damaged ones."""
     about = f"camera {name}"
     if watched.fault is not None:
         yield failed_from_error(about, watched.fault.removeprefix(f"{name}: "))
@@ -144,7 +144,7 @@ def _unseen_share(camera: CameraConfig) -> float:
 
 
 def coverage(rig: RigConfig) -> Finding:
-    """How much of the horizon the cameras see together."""
+    """The share of the horizon in view of the cameras."""
     built = build_rig(rig)
     seen = _seen_around(built, 0)
     if not seen.any():
@@ -159,14 +159,14 @@ def coverage(rig: RigConfig) -> Finding:
 
 
 def _seen_around(rig: Rig, down_deg: int) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Which of the 360 whole degrees clockwise from forward are seen, so far below the horizon."""
+    """Mask of the 360 whole degrees clockwise from forward that are in view, at an angle below the horizon."""
     angles, down = np.radians(np.arange(360)), math.radians(down_deg)
     level = np.stack([np.cos(angles), np.sin(angles), np.zeros(360)], axis=1)
     return rig.covers(math.cos(down) * level + [0.0, 0.0, math.sin(down)])
 
 
 def _gaps(blind: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> list[str]:
-    """From where to where, in whole degrees, around the circle."""
+    """Intervals of whole degrees around the circle."""
     begins = np.flatnonzero(blind & ~np.roll(blind, 1))
     ends = np.flatnonzero(blind & ~np.roll(blind, -1))
     if ends[0] < begins[0]:
@@ -175,7 +175,7 @@ def _gaps(blind: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> list[str]:
 
 
 def _flown(file: Path) -> tuple[int, float]:
-    """The larger, the later. By the flight's number: a drone's clock may be wrong."""
+    """Sort key, larger for later flights: the flight's number, because a drone's clock may be wrong."""
     number = 0
     with contextlib.suppress(RecordingError, OSError):
         number = flight_number(head_of(file)[0].facts)
@@ -187,7 +187,7 @@ _VAGUE_TURN_RAD = 0.9 * PRIOR_TURN_RAD
 
 
 def check_rig(config: DroneConfig, folder: Path | None, state_folder: Path = STATE_FOLDER) -> Iterator[Finding]:
-    """Of this drone's newest recording in the folder, named as for `check_disk`."""
+    """Checks the rig by this drone's newest recording in the folder, which is named as for `check_disk`."""
     files = [path for path in (folder or state_folder).glob(f"{config.name}-*.mcap") if not path.is_symlink()]
     newest = max(filter(Path.is_file, files), key=_flown, default=None)
     if newest is None:

@@ -1,4 +1,4 @@
-"""The computer: room for recordings, memory, temperature, clocks."""
+"""Checks the computer: space for recordings, memory, temperature, clocks."""
 
 from __future__ import annotations
 
@@ -15,21 +15,22 @@ from flockd.ground.doctor import Finding, failed, graded, passed, warned
 from flockd.onboard.daemon import THERMAL_ZONES, thermal_zones
 
 STATE_FOLDER = Path("/var/lib/flockd")
-"""Where the systemd unit lets flockd record."""
+"""Folder in which the systemd unit lets flockd record."""
 MB = 1e6
 NEEDS_MB = 350.0
-"""Resident, with the shipped networks and four cameras, beside what waits for the disk."""
+"""Resident memory with the shipped networks and four cameras, besides data that wait for the disk."""
 LEAST_MB = 2000.0
 """For one flight: five minutes of four cameras as PNG."""
 SPARE_MB = 200.0
 SPARE_K = 10.0
 MEMORY = Path("/proc/meminfo")
 YEARS = (2026, 2100)
-"""A clock that says another year was never set."""
+"""First possible year: a clock that shows an earlier one was never set."""
 
 
 def check_disk(config: DroneConfig, folder: Path | None, state_folder: Path = STATE_FOLDER) -> Iterator[Finding]:
-    """Whether recordings fit; ``folder`` as for `flockd run --record`; None: the ``state_folder`` of a service."""
+    """Whether recordings fit on the disk. ``folder``: as for `flockd run --record`; None: the service's
+    ``state_folder``."""
     folder = folder or (state_folder if state_folder.is_dir() else None)
     if folder is None:
         measured = "no folder for recordings was named, so none was checked"
@@ -51,7 +52,7 @@ def check_disk(config: DroneConfig, folder: Path | None, state_folder: Path = ST
 
 
 def judge_room(config: DroneConfig, folder: Path, free_mb: float, own_mb: float) -> Finding:
-    """The quota counts what this drone has recorded there before, and deletes the oldest of it."""
+    """Whether the quota fits: it includes this drone's recordings there, of which it deletes the oldest."""
     quota_mb, room_mb = config.recording.quota_mb, free_mb + own_mb
     measured = f"{free_mb / 1e3:.1f} GB free in {folder}, {own_mb / 1e3:.1f} GB are this drone's recordings"
     if room_mb < LEAST_MB:
@@ -63,7 +64,7 @@ def judge_room(config: DroneConfig, folder: Path, free_mb: float, own_mb: float)
 
 
 def check_memory(config: DroneConfig, meminfo: Path = MEMORY) -> Iterator[Finding]:
-    """Whether flockd fits beside what runs now."""
+    """Whether enough memory is free for flockd."""
     values = dict(line.split(":", 1) for line in meminfo.read_text(encoding="ascii").splitlines())
     free_mb, total_mb = (int(values[key].split()[0]) * 1024 / MB for key in ("MemAvailable", "MemTotal"))
     needs_mb = NEEDS_MB + config.recording.queue_mb
@@ -74,7 +75,7 @@ def check_memory(config: DroneConfig, meminfo: Path = MEMORY) -> Iterator[Findin
 
 
 def check_temperature(config: DroneConfig, folder: Path = THERMAL_ZONES) -> Iterator[Finding]:
-    """How hot it is now, at rest, and whether the processor is being slowed down for it."""
+    """The temperature at rest, and whether the processor is throttled."""
     zones = thermal_zones(folder)
     slowed = sorted(processors_slowed(folder))
     if slowed:
@@ -94,7 +95,7 @@ def check_temperature(config: DroneConfig, folder: Path = THERMAL_ZONES) -> Iter
 
 
 def processors_slowed(folder: Path) -> Iterator[str]:
-    """Cooling devices that are the processor itself, and at work."""
+    """Cooling devices that throttle the processor now."""
     for device in folder.glob("cooling_device*"):
         try:
             kind, state = (device / "type").read_text("ascii").strip(), int((device / "cur_state").read_text("ascii"))

@@ -1,4 +1,4 @@
-"""Models: intact, with the golden output, run by the right provider, and fast enough for the step."""
+"""Checks models: hash, golden output, provider, and the duration of a step."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from flockd.onboard.daemon import load_side_by_side
 from flockd.onboard.worker import GOLDEN_S, within
 
 STEPS = 4
-"""How many are timed. The first has no images before it, and warms up."""
+"""Number of steps that are timed. The first one has no previous images and warms up."""
 FULL = 0.8
-"""Share of `safety.degraded_load` above which a step is a warning: each further neighbour takes time too."""
+"""Share of `safety.degraded_load` above which a step's duration is a warning: each further neighbour takes time."""
 HEIGHT_M = 5.0
 PASSING_PX = 4
 SKY = (170, 190, 215)
@@ -32,7 +32,7 @@ GRASS = (80, 130)
 
 
 def check_models(config: DroneConfig) -> Iterator[Finding]:
-    """Each model of the configuration, and then how long a step takes with all of them."""
+    """Checks each model of the configuration, and then the duration of a step with all of them."""
     intact = True
     for finding in _each(config):
         intact = intact and finding.level is not Level.FAILURE

@@ -1,4 +1,4 @@
-"""Limits of the flight, and who else is there: on this computer, on the fleet."""
+"""Checks limits of the flight, other processes with this drone's autopilot, and the fleet."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from flockd.fleet.watcher import FleetWatcher
 from flockd.ground.doctor import Finding, failed, passed, warned
 
 LISTEN_S = 3.0
-"""Others try again every second to reach this drone."""
+"""Time to wait for others, which try to connect every second."""
 
 
 def check_limits(config: DroneConfig) -> Iterator[Finding]:

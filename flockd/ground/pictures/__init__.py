@@ -1,1 +1,1 @@
-"""Single-frame detection in pictures of any origin: finding and reading them, detecting, scoring, drawing."""
+"""Detection in pictures and videos of any origin: reading, detecting, tracking in videos, drawing."""

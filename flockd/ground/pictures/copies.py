@@ -1,4 +1,4 @@
-"""Copies of pictures and videos with what was detected drawn into them."""
+"""Copies of pictures and videos with the detections drawn into them."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ _CODEC = cv2.VideoWriter.fourcc(*"vp09")
 
 
 class Copies:
-    """A folder of copies, each at its picture's place in the folder that was named: JPEG stays JPEG, videos become MP4,
-    all else PNG. Or the copy of a single video, by its name."""
+    """A folder of copies with the structure of the given folder: JPEG stays JPEG, videos become MP4, others PNG. Or the
+    file name of the copy of a single video."""
 
     def __init__(self, out: Path, pictures: Sequence[PictureFile], *, overwrite: bool) -> None:
-        """Raises UsageError where a copy would take a file's place: before the work, not after it."""
+        """Raises UsageError, before any work, if a copy would overwrite a file."""
         self._targets: dict[PictureFile, Path] = {}
         self.written = 0
         sources = {picture.path.resolve() for picture in pictures}
@@ -92,7 +92,7 @@ def _write_image(file: Path, image: UInt8Array) -> None:
 
 _MASK_WEIGHT = 0.4
 _REFERENCE_PX = 900.0
-"""Longer side of a picture that lines of one pixel suit."""
+"""Longer side of a picture for lines of one pixel."""
 
 
 def annotated(image: UInt8Array, result: PictureResult) -> UInt8Array:
@@ -114,7 +114,7 @@ def annotated(image: UInt8Array, result: PictureResult) -> UInt8Array:
 
 
 def range_text(range_m: float, sigma_m: float, *, known: bool) -> str:
-    """A range with its standard deviation; where the kind is not known from where to where, in two of three cases."""
+    """A range with its standard deviation; for an unknown kind the interval that holds it in two of three cases."""
     if known:
         return f"{range_m:.2f} +- {sigma_m:.2f}"
     factor = math.exp(sigma_m / range_m)

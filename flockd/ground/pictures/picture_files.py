@@ -30,7 +30,7 @@ class Picture(NamedTuple):
     image: UInt8Array
     """(h, w, 3) RGB"""
     time_s: float = 0.0
-    """Of a frame, since the beginning of its video."""
+    """Time since the beginning of the video; None: an image."""
 
 
 @dataclass(frozen=True)
@@ -39,20 +39,20 @@ class PictureFile:
 
     path: Path
     root: Path
-    """The folder that was named, or the one that the file is in."""
+    """The folder given by the user, or the file's own."""
 
     @property
     def is_video(self) -> bool:
-        """By the end of its name."""
+        """Whether it is a video, by its suffix."""
         return self.path.suffix.lower() in VIDEO_SUFFIXES
 
     @property
     def relative(self) -> Path:
-        """To the folder that was named."""
+        """Path relative to the folder given by the user."""
         return self.path.relative_to(self.root)
 
     def count(self, every: int) -> int:
-        """How many pictures it is about, for a progress bar."""
+        """Approximate number of pictures, for a progress bar."""
         if not self.is_video:
             return 1
         with opened_video(self.path) as opened:
@@ -64,7 +64,7 @@ class PictureFile:
             return (opened.get(cv2.CAP_PROP_FPS) or _USUAL_RATE_HZ) / every
 
     def images(self, every: int) -> Iterator[Picture]:
-        """As the camera was held; ``every``-th frames of a video.
+        """Reads the image, or every ``every``-th frame of a video, upright.
 
         Raises DatasetError where it cannot be read.
         """
@@ -84,21 +84,20 @@ class PictureFile:
 
 
 SMALLEST_PX = 32
-"""Sides of the smallest image of a camera, as in `rig.cameras[].size_px`."""
+"""Smallest side of an image, as in `rig.cameras[].size_px`."""
 _USUAL_RATE_HZ = 30.0
-"""Of videos that do not say theirs."""
+"""Frame rate of videos that do not give theirs."""
 
 
 def find_pictures(
     paths: Sequence[Path], but_not: Path | None = None, left_out: Callable[[str], None] = lambda sentence: None
 ) -> list[PictureFile]:
-    """The images and videos that are named, and those in the folders that are named and below; each once.
+    """The given images and videos, and those in the given folders and below; each once.
 
-    ``left_out`` is called with what a folder holds of kinds that are not read.
+    ``left_out`` is called with a sentence about files of a folder that are not read.
 
-    Files whose name begins with a dot are other programs' notes, and count only where they are named. Nor
-    does what lies in ``but_not``, a folder of copies inside one that is named.
-    Raises UsageError for what is not there, is no file, is neither, or is a folder without any.
+    In folders, names that begin with a dot and the contents of ``but_not``, a folder of copies, are ignored. Raises
+    UsageError for a path that does not exist, is neither image nor video, or is a folder without any.
     """
     endings = SUFFIXES | VIDEO_SUFFIXES
     copies = None if but_not is None else but_not.resolve()
