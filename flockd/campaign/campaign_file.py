@@ -1,4 +1,4 @@
-"""A campaign's file: which flights are flown, and what is measured."""
+"""A campaign's file: its flights, and the figures to measure."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Variation(Section):
     """The values of one key."""
 
     values: Annotated[tuple[Any, ...], Field(min_length=1, max_length=MAX_VALUES)]
-    """Each is a part of the grid."""
+    """Values of the grid."""
 
     @model_validator(mode="before")
     @classmethod
@@ -41,37 +41,37 @@ class CampaignConfig(Section):
     """A campaign: many flights of one scenario."""
 
     campaign: _Name
-    """Its name, and by default that of its folder."""
+    """Its name; by default also the name of its folder."""
     scenario: str
     """The path of the scenario's file, relative to this one."""
     perception: FlightKindName = "truth"
-    """`truth`: without images, on exact relative states or, with the scenario's `detections`, on what drones track of
-    made-up ones; `sight`: on networks, from rendered images."""
+    """`truth`: without images, on exact relative states or, with the scenario's `detections`, on tracks of simulated
+    detections. `sight`: networks on rendered images."""
     gated: bool = True
-    """Whether each drone flies through its safety gate, as in the daemon; false: to study the flocking law alone."""
+    """Whether each drone flies through its safety gate, as in the daemon. false: the flocking law alone."""
     seed: Annotated[int, Field(ge=0, le=2**53)] = 0
-    """Flight n of each cell, from 0, flies with the scenario's seed `seed` + n, in all cells alike: so differences
-    between cells and between campaigns are of flights with the same gusts and worlds."""
+    """Flight n of each cell, from 0, has the scenario's seed `seed` + n, the same in all cells: so flights with the
+    same gusts and worlds are compared."""
     paired: bool = True
-    """False: each cell has seeds of its own, cell c from `seed` + c `seeds` on: so all flights are independent."""
+    """false: each cell has other seeds, cell c from `seed` + c `seeds` on, so that all flights are independent."""
     seeds: Annotated[int, Field(ge=1, le=MAX_SEEDS)]
-    """Flights of each cell."""
+    """Number of flights of each cell."""
     fixed: dict[str, Any] = Field(default_factory=dict)
     """Values of keys for all flights, by dotted key: `drone.flocking.cohesion: 0.2`, `duration_s: 40`. `drones` is the
     size of the flock."""
     scatter_m: NonNegative = 0.0
-    """Each flight moves every start by up to this much to the north and to the east, by its seed."""
+    """Largest random shift of every start to the north and to the east, by the flight's seed."""
     vary: dict[str, Variation] = Field(default_factory=dict)
-    """What varies, by dotted key. All combinations are flown, each is a cell."""
+    """Keys that vary, with dots. All combinations of their values are flown; each is a cell."""
     cases: dict[_Name, dict[str, Any]] = Field(default_factory=dict)
     """Named sets of values, each flown in all combinations of `vary`, as in
     `new: {drone.perception.models_dir: new_models}`."""
     measure: Annotated[tuple[Figure, ...], Field(min_length=1)] | None = None
-    """Figures to keep; none: all."""
+    """Figures to keep; empty: all."""
 
     @property
     def wanted(self) -> tuple[Figure, ...]:
-        """What is measured."""
+        """The figures to measure."""
         return self.measure or tuple(MEASURES)
 
     def seed_of(self, cell: int, number: int) -> int:

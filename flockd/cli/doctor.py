@@ -52,7 +52,7 @@ def add(commands: Commands) -> None:
     option(parser, "--seconds S", seconds, duration)
     option(parser, "--only CHECK", f"run only this check, one of {', '.join(CHECKS)}", action="append", choices=CHECKS)
     flag(parser, "--bench", "run the daemon and time its steps; needs --demo, and the extra `sim`")
-    flag(parser, "--demo", "with nothing attached: a made-up autopilot, and images drawn by the simulator")
+    flag(parser, "--demo", "without hardware: with a simulated autopilot and rendered images")
     flag(parser, "--json", "print JSON")
     add_force(parser)
 

@@ -25,10 +25,10 @@ LONGEST_OPERATOR = 40
 
 
 def add_endpoint_options(parser: Parser, listen: str = "--listen") -> None:
-    """Adds the fleet's name and the endpoints; ``listen``: the option for where drones connect to."""
+    """Adds the fleet's name and the endpoints; ``listen``: the option for the endpoint at which it listens."""
     option(parser, "--fleet NAME", "watch only this fleet; by default all that are found", _fleet)
     option(parser, "--connect ENDPOINT", f"connect to this drone or router; by default {ENDPOINT}", action="append")
-    parser.add_argument(listen, metavar="ENDPOINT", action="append", dest="drones_at", help="where drones connect to")
+    parser.add_argument(listen, metavar="ENDPOINT", action="append", dest="drones_at", help="listen here for drones")
     option(parser, "--zenoh-config FILE", "a file of zenoh's settings, for example for TLS", Path)
 
 

@@ -36,17 +36,16 @@ MIN_START_DISTANCE_M = 0.7
 
 
 class StartConfig(Section):
-    """Where one vehicle begins."""
+    """The start of one vehicle."""
 
     position_m: Vector3
     """North, east, down: a height of 4.5 m is -4.5."""
     velocity_m_s: tuple[float, float] = (0.0, 0.0)
     """North, east."""
     mission: MissionParameters | None = None
-    """Its own; null: that of `drone`. Places count from the world's origin."""
+    """Its own mission; null: that of `drone`. Positions count from the world's origin."""
     by_hand: bool = False
-    """A person flies it along its mission, in Position mode and without flockd; to the others it looks like one of
-    them."""
+    """Whether a person flies it along its mission, in Position mode and without flockd; it looks like the others."""
 
 
 _Wind = Annotated[float, Field(ge=-50, le=50)]
@@ -54,8 +53,8 @@ _Wind = Annotated[float, Field(ge=-50, le=50)]
 
 
 class VehicleConfig(Section):
-    """How a simulated multirotor answers a velocity setpoint: by default as PX4 1.18's vehicle in software does, from
-    its answers to steps of up to 4 m/s (tests/sim/autopilot/px4_steps.csv)."""
+    """Response of a simulated multirotor to velocity setpoints; by default that of PX4 1.18 in software to steps of up
+    to 4 m/s (tests/sim/autopilot/px4_steps.csv)."""
 
     dead_time_s: Annotated[float, Field(ge=0, le=5)] = 0.2
     velocity_time_constant_s: Positive = 0.39
@@ -67,35 +66,35 @@ class VehicleConfig(Section):
     wind_m_s: tuple[_Wind, _Wind] = (0.0, 0.0)
     """Mean wind, north and east."""
     gust_m_s: Speed = 0.0
-    """Standard deviation of the velocity that gusts add, each axis, to that of a drone whose setpoint stays the same.
-    Gusts carry drones under the flocking law farther, because its setpoint begins at the own velocity."""
+    """Standard deviation of the velocity that gusts add, each axis, at a constant setpoint. Under the flocking law
+    gusts carry drones farther, because its setpoint starts from the own velocity."""
     gust_length_m: Annotated[float, Field(ge=1, le=1000)] = 36.6
-    """Length of gusts: drones much nearer to each other than this are pushed alike. By default that of MIL-F-8785C at a
+    """Length of gusts: they push drones alike that are much nearer to each other. By default that of MIL-F-8785C at a
     height of 5 m over open ground; it is less among trees and houses."""
     radius_m: Annotated[float, Field(gt=0, le=5)] = 0.35
-    """Radius of the sphere around its centre that holds the whole drone: nearer to an obstacle it collides."""
+    """Radius of the sphere around its centre that contains the drone; a nearer obstacle is a collision."""
 
 
 class RangeFinderConfig(Section):
-    """A simulated range finder that faces down, and what separates its readings from the truth."""
+    """A simulated range finder that faces down, and its errors."""
 
     rate_hz: Annotated[float, Field(gt=0, le=200)] = 30.0
     noise: Share = 0.015
-    """Standard deviation of a reading, as a share of it; 0.01 m at least, as MAVLink sends centimetres."""
+    """Standard deviation of a reading, as a share of the range; at least 0.01 m, because MAVLink sends centimetres."""
     min_m: NonNegative = 0.15
-    """Nearer ground is not measured: the reading then has no signal."""
+    """Shortest range; a reading of nearer ground has no signal."""
     max_m: Positive = 20.0
-    """Farther ground is not measured either."""
+    """Longest range, likewise."""
     tilt_deg: Annotated[float, Field(ge=0, le=10)] = 0.5
-    """Standard deviation of the angle, about each axis, by which it is mounted off the body's down axis."""
+    """Standard deviation of its mounting angle from the body's down axis, about each axis."""
     dropouts_per_min: NonNegative = 2.0
-    """How often it stops giving readings."""
+    """Mean number of dropouts per minute."""
     dropout_s: Positive = 0.5
-    """Mean duration of such a dropout."""
+    """Mean duration of a dropout."""
 
 
 class SensorConfig(Section):
-    """What separates the simulated autopilot's and cameras' readings from the truth."""
+    """Errors of the simulated autopilot's estimates and of the cameras."""
 
     barometer_drift_m: NonNegative = 0.2
     """Standard deviation of the slow height error."""
@@ -104,15 +103,15 @@ class SensorConfig(Section):
     attitude_error_deg: NonNegative = 0.2
     """Standard deviation of the slow roll and pitch error."""
     heading_error_deg: NonNegative = 2.0
-    """The same of the heading."""
+    """The same for the heading."""
     turn_rate_noise_deg_s: NonNegative = 1.0
     """Standard deviation of the noise on the rate of turn, each axis."""
     velocity_error_m_s: NonNegative = 0.1
-    """Standard deviation of the wandering error of the autopilot's own velocity, each axis, as measured of PX4 1.18."""
+    """Standard deviation of the slow error of the autopilot's velocity, each axis, as measured with PX4 1.18."""
     velocity_error_time_s: Positive = 2.0
     """How long that error stays about the same."""
     position_error_m: NonNegative = 0.1
-    """Standard deviation of the wandering error of its own position, each axis."""
+    """Standard deviation of the slow error of the autopilot's position, each axis."""
     position_error_time_s: Positive = 5.0
     """How long that error stays about the same."""
     range_finder: RangeFinderConfig | None = RangeFinderConfig()
@@ -128,32 +127,32 @@ _ONLY_FOR = {"trees_per_hectare": "forest", "houses_per_hectare": "village"}
 
 
 class ClearingConfig(Section):
-    """A circle that is kept free of obstacles, for a place where a flock is to gather."""
+    """A circle without obstacles, for example where a flock gathers."""
 
     north_m: _Metres
-    """From the world's origin; so `east_m`."""
+    """From the world's origin; `east_m` likewise."""
     east_m: _Metres
     radius_m: Annotated[float, Field(gt=0, le=50)] = 5.0
 
 
 class ObstaclesConfig(Section):
-    """What stands around the world's origin, drawn from the scenario's seed."""
+    """Obstacles around the world's origin, drawn from the scenario's seed."""
 
     kind: ObstacleKind
     """`forest`: trunks with crowns above the drones, and a few young trees with branches down to the ground;
     `village`: a street from south to north with poles and wires, and houses, walls and trees beside it."""
     extent_m: Annotated[float, Field(ge=15, le=75)] = 60.0
-    """They stand within this distance of the origin, north and east."""
+    """Largest distance from the origin, north and east."""
     trees_per_hectare: Annotated[float, Field(ge=50, le=400)] = 100.0
-    """For `forest`: 100 are an old beech wood, 400 a dense plantation."""
+    """For `forest`: 100 as in an old beech wood, 400 as in a dense plantation."""
     houses_per_hectare: Annotated[float, Field(ge=2, le=16)] = 8.0
     """For `village`."""
     min_gap_m: Annotated[float, Field(ge=1, le=6)] = 2.0
-    """Between two trees, houses or walls, measured from the circles around them."""
+    """Least gap between the circles around two trees, houses or walls."""
     free_start_m: NonNegative = 4.0
-    """Kept free around each start position."""
+    """Radius without obstacles around each start position."""
     clearings: Annotated[tuple[ClearingConfig, ...], Field(max_length=100)] = ()
-    """More places to be kept free."""
+    """Further places without obstacles."""
 
     @model_validator(mode="after")
     def _keys_fit_the_kind(self) -> Self:
@@ -171,16 +170,15 @@ class WorldConfig(Section):
     ground_relief_m: NonNegative = 0.15
     """Standard deviation of the gently uneven ground; 0 is flat."""
     hills_m: Annotated[float, Field(ge=0, le=20)] = 0.0
-    """From the lowest to the highest point of its hills, where `hills_slope` permits that; level at the origin."""
+    """Height from the lowest to the highest point of hills, if `hills_slope` permits it; level at the origin."""
     hills_slope: Annotated[float, Field(gt=0, le=0.5)] = 0.15
-    """Rise for each metre where they are steepest."""
+    """Steepest slope of the hills."""
     clearance_m: NonNegative = 9.0
     """Width without obstacles on both sides of the planned path."""
     drone_family: Annotated[int, Field(ge=0, le=FAMILIES - 1)] | Literal["any"] = "any"
     """Shape of the drones; `any`: drawn from the seed, the same for the whole flock."""
     obstacles: ObstaclesConfig | None = None
-    """Trees, or houses, walls, poles and wires, for the flock to fly between, on level ground; null: none within
-    `clearance_m`."""
+    """Trees, or houses, walls, poles and wires, on level ground; null: no obstacles within `clearance_m`."""
 
     @model_validator(mode="after")
     def _obstacles_stand_on_level_ground(self) -> Self:
@@ -200,29 +198,29 @@ _TRAINED = _PERCEIVED["trained"]
 
 
 class DetectionsConfig(Section):
-    """Detections made up from the truth with errors that last, for flights without images through the drone's own
-    tracker, which is wrong about the drone's own way by 2 cm a step. Errors are by default those that flights by sight
-    had (config/perceived/shipped_networks.yaml). In the view of a camera that has one of `faults`
-    nobody is detected, and the drone flies degraded."""
+    """Detections drawn from the truth with persistent errors, for flights without images. They go through the drone's
+    tracker; the own displacement is wrong by 2 cm a step. By default the errors are those of flights by sight
+    (config/perceived/shipped_networks.yaml). A camera with one of `faults` detects no drone, and the drone flies
+    degraded."""
 
     airframe: Literal["trained", "unknown"] = "trained"
-    """Source of the errors that are not given here: airframes that the networks learnt, by default as below, or real
-    ones, whose size is known and whose ranges no network learnt."""
+    """Source of errors that are not given here: airframes of the networks' training, or real airframes of known size
+    that are not in the training."""
     range_m: Positive = 20.0
-    """Drones beyond this are not detected."""
+    """Largest range at which drones are detected."""
     missed: Share | None = None
-    """Probability that a drone is not detected in a step, the same at all distances; null: at each distance as it was
-    measured, 1 beyond those."""
+    """Probability that a drone is not detected in a step, at all distances; null: as measured at each distance, 1
+    beyond."""
     range_error: Annotated[float, Field(gt=0, le=1)] = _TRAINED["range_error"]
     """Standard deviation of the logarithm of a range."""
     bearing_error_rad: Annotated[float, Field(gt=0, le=1)] = _TRAINED["bearing_error_rad"]
     """Standard deviation of a bearing, each axis."""
     error_time_s: NonNegative = _TRAINED["error_time_s"]
-    """How long errors stay about the same; 0: each step has its own."""
+    """Time constant of errors; 0: independent in each step."""
     missed_time_s: NonNegative = _TRAINED["missed_time_s"]
-    """How long misses last, likewise."""
+    """Time constant of misses, likewise."""
     false_at_once: Share = _TRAINED["false_at_once"]
-    """Mean number of false neighbours that a drone has at a time, one at most; each stays where it is."""
+    """Mean number of false neighbours of a drone at a time, at most one; a false neighbour does not move."""
     false_time_s: Positive = _TRAINED["false_time_s"]
     """Mean duration of a false neighbour, from its confirmation on."""
     false_m: tuple[Positive, Positive, Positive] = _TRAINED["false_m"]
@@ -230,11 +228,11 @@ class DetectionsConfig(Section):
 
     @property
     def filled(self) -> Self:
-        """With the errors of the airframe where none are written."""
+        """With the errors of the airframe for those that are not given."""
         return type(self)(**{**_PERCEIVED[self.airframe], **self.model_dump(exclude_unset=True)})
 
     def missed_at(self, range_m: float) -> float:
-        """Probability that a drone so far away is not detected in a step."""
+        """Probability that a drone at this range is not detected in a step."""
         if range_m > self.range_m:
             return 1.0
         if self.missed is not None:
@@ -251,12 +249,12 @@ class CameraFaultConfig(Section):
     camera: str
     """Its name in the rig."""
     begin_s: NonNegative = 0.0
-    """Counted from the first image of the flight; with PX4, that is before the take-off."""
+    """Time since the first image of the flight; with PX4 that is before the take-off."""
     end_s: Positive = MAX_DURATION_S
 
 
 class TakeoverConfig(Section):
-    """One drone's autopilot takes over in flight, as when a person flips a switch: flockd no longer flies it."""
+    """One drone's autopilot takes over in flight, as if its pilot had selected another mode."""
 
     drone: Annotated[int, Field(ge=1)]
     """The drone: the number of its entry in `vehicles`, from 1."""
@@ -289,33 +287,33 @@ class ScenarioConfig(Section):
     """One step of the drone at least, one day at most."""
     seed: Annotated[int, Field(ge=0)] = 0
     ideal: bool = False
-    """Easier than reality, for studies of a part: gates know the truth, autopilots fly by it, steps take no time,
-    drones' clocks and frames keep time, vehicles answer at once. Keys that are given beside it still count."""
+    """Easier than reality, for studies of a part: gates and autopilots know the truth, steps take no time, clocks and
+    frames are exact, vehicles respond at once. Keys given besides it still hold."""
     latency_s: Annotated[float, Field(ge=0, le=5)] | None = None
-    """From the images until the resulting commands are flown. null: 0.25 s, or a step if that is shorter; 0 where
-    `ideal`."""
+    """Delay from the images to the resulting setpoints. null: 0.25 s, or a step if that is shorter; 0 if `ideal`."""
     clocks_apart_s: Annotated[float, Field(ge=0, le=10)] | None = None
-    """Standard deviation of the time at which each drone leaves the paper's circle, as drones' clocks differ. null: 0.2
-    s; 0 where `ideal`."""
+    """Standard deviation of the time at which each drone leaves the paper's circle, because clocks differ. null: 0.2 s;
+    0 if `ideal`."""
     vehicles: Annotated[tuple[StartConfig, ...], Field(min_length=1, max_length=MAX_DRONES)]
     vehicle: VehicleConfig = VehicleConfig()
     sensors: SensorConfig = SensorConfig()
     cameras: CamerasConfig | None = None
-    """Faults of the cameras. null: images are as old as their time stamps say, to 2 ms; where `ideal`, only
-    `sensors.image_noise`."""
+    """Faults of the cameras. null: only `sensors.image_noise`, and time stamps are exact to 2 ms, or exact if
+    `ideal`."""
     world: WorldConfig = WorldConfig()
     detections: DetectionsConfig | None = None
-    """For `--perception truth`: drones know each other by tracking such detections; null: exactly and at once."""
+    """For `--perception truth`: drones track such detections of each other; null: they know exact states without
+    delay."""
     faults: tuple[CameraFaultConfig, ...] = ()
-    """Cameras that fail in flight; by default none."""
+    """Cameras that fail in flight."""
     takeovers: tuple[TakeoverConfig, ...] = ()
-    """Autopilots that take over in flight; by default none. Not with real daemons."""
+    """Autopilots that take over in flight; not with real daemons."""
     drone: DroneConfig
-    """In the file: the path of the drone's own configuration, relative to the scenario's; or that configuration. Keys
-    `mission` and `obstacles` beside it are flown instead of its own."""
+    """The path of the drone's configuration, relative to the scenario's file, or the configuration itself. The
+    scenario's keys `mission` and `obstacles` replace its own."""
 
     def drone_of(self, vehicle: int) -> DroneConfig:
-        """The configuration that one vehicle's pilot flies with."""
+        """The configuration of one vehicle's pilot."""
         mission = self.vehicles[vehicle].mission or self.drone.mission
         if mission.kind == "circle_then_tangent":
             late_s = self._clocks_apart_s * random.Random(f"clock {self.seed} {vehicle}").gauss(0.0, 1.0)
@@ -362,7 +360,7 @@ class ScenarioConfig(Section):
 
     @property
     def missions(self) -> list[tuple[MissionParameters, bool]]:
-        """That of each vehicle, and whether it is flown by hand."""
+        """The mission of each vehicle, and whether it is flown by hand."""
         return [(self.drone_of(i).mission, vehicle.by_hand) for i, vehicle in enumerate(self.vehicles)]
 
     def warnings(self) -> list[str]:

@@ -326,7 +326,7 @@ class _Sluggish:
 @pytest.mark.fault("autopilot-oscillates", within_s=25.0)
 @pytest.mark.parametrize(
     ("late_s", "state", "told"),
-    [(0.6, "degraded", "follows them 0.5 s later than expected"), (1.7, "asking", " s later than expected (at most")],
+    [(0.6, "degraded", "follows them 0.5 s later than expected"), (1.7, "asking", " s later than expected (limits")],
     ids=["half a second", "seconds"],
 )
 async def test_an_autopilot_that_follows_late_is_told_as_such_and_nothing_makes_up_for_it(

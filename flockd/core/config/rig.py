@@ -85,7 +85,7 @@ def _lens_faults(lens: IntrinsicsConfig, size: tuple[int, int]) -> dict[str, str
     again = "correct it, or calibrate the camera at the size of its images"
     if len(lens.distortion) not in _COEFFICIENTS[lens.model]:
         known = "k1 k2 k3 k4" if lens.model == "wide_angle" else "k1 k2 p1 p2, and k3 or not"
-        told = f"has {len(lens.distortion)} coefficients, and those of {lens.model} are none, or {known}"
+        told = f"has {len(lens.distortion)} coefficients; {lens.model} takes none, or {known}"
         return {"distortion": f"{told}; give these, as `flockd calibrate import` fits them"}
     faults = {
         key: f"{value:g} is {abs(value / length - 0.5):.0%} of the image off the middle of {words}; {again}"

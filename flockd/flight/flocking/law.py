@@ -12,7 +12,7 @@ from flockd.core.messages import BoolArray, FloatArray
 from flockd.flight.geometry.level import SAME_SPOT_M, limit_norm
 
 _MIN_DISTANCE_M = 1e-3
-"""Shortest distance used: Eq. 39 and 41 have a pole at zero."""
+"""Least distance in Eq. 39 and 41, which have a pole at zero."""
 SAMPLING_TIME_S = 0.5
 """The sampling time st of the paper, and the shortest one used. A command is the own velocity plus u st. A lasting
 error e of the own velocity shifts the equilibrium to u = -e / st, so short steps would amplify it."""
@@ -97,7 +97,8 @@ def lookahead_s(step_s: float) -> float:
 
 
 def level_offsets(offsets: FloatArray) -> FloatArray:
-    """(n, 2) metres north and east of neighbours at (n, 3) metres NED, such that drones above each other separate.
+    """(n, 2) metres north and east of neighbours at (n, 3) metres NED, adjusted so that drones above each other
+    separate.
 
     Directions within `SAME_SPOT_M` are noise; two drones with the same noise would fly off in the same direction. Such
     a neighbour is placed at that distance to the west if it is below, else to the east. Both fly apart: the upper one

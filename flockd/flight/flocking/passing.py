@@ -15,14 +15,14 @@ from flockd.flight.safety.half_planes import NO_LIMITS, ROUNDING_M_S, Limits, cr
 HORIZON_S = 2.5
 """Time within which a conflict with a neighbour is resolved: five steps of the paper's pilot."""
 _SHARE = 0.5
-"""Each of two drones makes half of the needed change of velocity. If the other makes none, each next step makes half of
-the rest. If the conflict with an approaching drone is within the horizon, the drone makes the whole change."""
+"""Share of the needed change of velocity that each of two drones makes. If the other makes none, each next step makes
+half of the rest. If the conflict with an approaching drone is within the horizon, the drone makes the whole change."""
 _HEAD_ON_RAD = 0.1
-"""A course that misses a neighbour by a smaller angle is head-on: each turns to its right, as aircraft do (ICAO Annex
-2, Rules of the Air, 3.2.2.2)."""
+"""Angle of a miss below which an encounter is head-on: each drone turns to its right, as aircraft do (ICAO Annex 2,
+Rules of the Air, 3.2.2.2)."""
 _COMES_M_S, _COMES_S = 0.5, 2 * HORIZON_S
-"""The drone sidesteps, instead of backing off, a neighbour that approaches at least this fast and would be too near
-within the second number of seconds."""
+"""Least closing speed of a neighbour that the drone sidesteps instead of backing off, and time within which it would be
+too near."""
 _RING = 24
 _SPEEDS = 1.0, 0.5
 """Shares of the highest speed that are tried in all directions if no velocity keeps clear of all."""

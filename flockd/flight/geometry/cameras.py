@@ -99,7 +99,7 @@ class Camera(ABC):
 class PinholeCamera(Camera):
     """The pinhole (Eq. 1-6), distorted by OpenCV's k1 k2 p1 p2 [k3].
 
-    A point behind the camera, or so far out that the distortion polynomial folds back into the image, has NaN pixels.
+    Points behind the camera, or beyond the angle at which the distortion polynomial folds back, have NaN pixels.
     """
 
     _coefficient_counts = (0, 4, 5)

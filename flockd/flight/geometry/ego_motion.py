@@ -22,10 +22,11 @@ class EgoMotionAcceptance:
     explained_px: float = 3.0
     """A motion explains a match if it moves it to within this distance."""
     min_explained: float = 0.08
-    """Least share of all matches. On real images true motions explain 15 % and more. Motions found in false matches
-    only, some of which always agree within metres, explain less than 6 %."""
+    """Least share of all matches that a motion explains. On real images true motions explain at least 15 %. Motions
+    found in false matches only, some of which always agree within metres, explain less than 6 %."""
     min_kept: float = 0.9
-    """Least share of the explained matches after the refinement: one that loses more has followed false matches."""
+    """Least share of the explained matches that the refinement keeps; if it loses more, it has followed false
+    matches."""
 
 
 ACCEPTANCE = EgoMotionAcceptance()

@@ -17,7 +17,7 @@ from flockd.flight.geometry.sightlines import products, times, whitening
 from flockd.flight.geometry.transform import RigidTransform
 
 _MAX_PAIRS = 800
-"""Pairs used, drawn at random: each costs two residuals a step."""
+"""Number of pairs used, drawn at random; each has two residuals."""
 FLOW_SIGMA_PX = 0.3
 _DEPTH_SIGMA = 0.05
 """Relative error of depth. Only its ratio to the flow's error matters: residuals show the common scale."""
@@ -25,10 +25,10 @@ _CAUCHY_SIGMAS = 1.2
 """Scale of Cauchy's kernel in standard deviations, half of the 2.385 for Gaussian errors: the depth of a whole object
 is wrong together. It halved the error at depth errors of 15 %, and costs 5 % if all errors are Gaussian."""
 _UNSEEN_PX = 1e3
-"""Residual of a point that a motion moves out of the lens's image."""
+"""Residual, px, of a point that a motion moves out of the lens's image."""
 _ROUGH_STEPS, _MOST_STEPS, _SETTLED = 3, 20, 1e-4
-"""Gauss-Newton steps before residual scale and parallax directions are fixed; the most steps in all; and the size of a
-step, in radians and metres, below which they end."""
+"""Number of Gauss-Newton steps before residual scale and parallax directions are fixed; largest number of steps; and
+size of a step, in radians and metres, at which they end."""
 _MAX_CONDITION = 1e12
 """Largest condition number of the normal equations: beyond it the motion is not observable."""
 

@@ -13,7 +13,7 @@ RELIEF = 0.03
 """Standard deviation of the ground's departure from its plane at the place, relative to the range; it grows with
 distance from the place."""
 NEAR_EXPECTED = 0.35
-"""A point counts as ground if its inverse range is within this share of the expected plane's."""
+"""Largest deviation of a ground point's inverse range from the expected plane's, as a share."""
 REACH = 1.0
 """Radius around the place in which the ground is used, in heights: the larger, the less it is a plane."""
 MIN_POINTS = 60

@@ -13,7 +13,7 @@ from flockd.flight.mission.guidance import Guidance, Moment, course_of, towards
 from flockd.flight.mission.places import place_of_waypoint
 
 PATIENCE_S = 5.0
-"""A waypoint within this flight time counts as reached if the flock has come no nearer for this time."""
+"""A waypoint within this flight time counts as reached if the flock has come no nearer for the same time."""
 PROGRESS = 0.05
 """Least share of its speed at which a flock comes nearer to a waypoint."""
 

@@ -13,9 +13,9 @@ from flockd.core.messages import SECTORS, BoolArray, FloatArray, IntArray, Obsta
 from flockd.flight.geometry import Rig
 
 _CONSISTENT_SIGMAS = 3.0
-"""Two ranges that differ by no more standard deviations may be of one obstacle."""
+"""Largest difference, in standard deviations, of two ranges of one obstacle."""
 _CONTRADICTIONS = 2
-"""An obstacle is deleted after so many steps with longer ranges in its direction."""
+"""Number of steps with longer ranges in its direction after which an obstacle is deleted."""
 
 AZIMUTHS = 2 * math.pi / SECTORS * np.arange(SECTORS)
 """(SECTORS,) radians, clockwise from north: the sectors' middles."""

@@ -24,7 +24,7 @@ from flockd.flight.geometry import Rig, RigCamera, grid_pixels
 from flockd.flight.perception.observation import Observation
 
 _STRIDE_PX = 4
-"""Distance of the pixels used: a trunk of 0.2 m at 10 m is 4 px wide at 222 px per radian."""
+"""Spacing of the pixels used: a trunk of 0.2 m at 10 m is 4 px wide at 222 px per radian."""
 _NEAREST_M = 0.3
 _RATIO = 1.1
 """Ratio of the ranges of successive bins."""

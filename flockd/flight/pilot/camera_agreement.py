@@ -12,7 +12,7 @@ from flockd.flight.geometry import PointPairs, Rig, RigidTransform, moved_pixels
 from flockd.flight.pilot.own_motion import ERROR_M_S
 
 _MOVED_PX, _FEWEST = 2.0, 40
-"""Pixels that a point has to move to have a direction, and the fewest such points in a step."""
+"""Least displacement of a point, px, with a direction, and least number of such points in a step."""
 _TIME_S, _SURE = 8.0, 0.4
 """Time constant in s, and the mean beyond which a camera agrees or contradicts: four seconds if all points do."""
 

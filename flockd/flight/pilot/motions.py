@@ -9,7 +9,7 @@ from flockd.flight.geometry import PointPairs, Rig, RigCamera, grid_pixels, lift
 from flockd.flight.perception import Observation
 
 _LEAST_MATCHES = 300
-"""Matches of one image: at 640x480 pixels, 300 gave the own motion as precisely as 4,800."""
+"""Number of matches of one image: at 640x480 pixels, 300 gave the own motion as precisely as 4,800."""
 
 
 def background_pairs(rig: Rig, observation: Observation, parameters: GeometryParameters) -> PointPairs:

@@ -22,7 +22,7 @@ SCALE = 0.03
 _AGES_M_S2 = 2.0
 """Growth of a velocity's standard deviation with the time between it and the frames, in m/s per second."""
 _MOST_M_S = 100.0
-"""A velocity above this is taken for an error of the autopilot. Also the limit of standard deviations."""
+"""Velocity above which the autopilot's estimate counts as wrong; also the limit of standard deviations."""
 
 
 class OwnMotion:

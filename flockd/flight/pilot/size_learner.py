@@ -1,9 +1,10 @@
-"""The size of the other drones: how far it may be off, and how a drone learns it in flight if so configured.
+"""The size of the other drones: its uncertainty for the gate, and how a drone learns it in flight if configured.
 
 An apparent size gives the range only in units of the drone's size. If the own drone moves by a known distance and its
 neighbours do not follow, their bearings shift by that distance over the range, which gives metres. Flock mates follow
-any other motion. In units of the drones' size, a neighbour's height below the own drone is a smooth course of its own
-plus the own weave over the size. That is linear in the scale, 1 / size, which all neighbours share.
+every horizontal motion, so the drone weaves up and down. In units of the drones' size, a neighbour's height below the
+own drone is a smooth course of its own plus the own weave over the size. That is linear in the scale, 1 / size, which
+all neighbours share.
 """
 
 from __future__ import annotations
@@ -29,16 +30,18 @@ _JUDGED_SIGMA = 0.5
 _PLAUSIBLE = 2.0
 """Largest factor between a learned size and the networks': drones that rise together look larger."""
 _ROBUST_SIGMA, _TIMES = 2.5, 10
-"""Deviations beyond which a track's scale loses weight, as it may be of a tree; iterations of the weighting."""
+"""Standard deviations beyond which a track's scale loses weight, because it may be of a tree; iterations of the
+weighting."""
 _LASTS_S = PERIOD_S / (2 * math.pi)
 """Time between independent measurements: errors of bearings and heights persist, as an Ornstein-Uhlenbeck process. With
 this time constant they have the most power at the weave's frequency."""
 _JUDGED, _NEAR_M = 400, 8.0
-"""Newest sizes by the networks that are kept, and the largest range of their drones: farther ones are unreliable."""
+"""Number of the networks' newest sizes that are kept, and largest range of their drones: farther ones are
+unreliable."""
 _FEWEST_DOUBTS, _DOUBTED = 8, 0.15
-"""The networks do not know the drones if the median of so many of their standard deviations of log size is above the
-second number: it is 0.01 to 0.06 for families of the training, 0.31 for two others. The gate then uses the second
-number: twice that is near the error of these two. With 0.31 drones would stop before each other most of the time."""
+"""The networks do not know the drones if the median of this number of their standard deviations of log size is above
+the limit; it is 0.01 to 0.06 for families of the training, 0.31 for two others. The gate then uses the limit, twice of
+which is near the error of these two. With 0.31 drones would stop in front of each other most of the time."""
 
 
 class SizeLearner:

@@ -12,10 +12,11 @@ from flockd.flight.geometry.level import SAME_SPOT_M
 from flockd.flight.safety.half_planes import Limits
 
 COLUMN = 1.5
-"""A neighbour within this many degraded separations, horizontally, is above or below: downwash widens on its way down,
-and drones do not hold their positions exactly."""
+"""Horizontal distance, in degraded separations, within which a neighbour is above or below the drone: downwash widens
+on its way down, and drones do not hold their positions exactly."""
 _HEIGHT_NOISE_M = 0.3
-"""Noise of a height over a few seconds: a smaller difference between commanded and own height is no climb."""
+"""Noise of a height over a few seconds: a smaller difference between commanded and own height does not count as a
+climb."""
 
 
 def towards_neighbours(

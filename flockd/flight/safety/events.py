@@ -182,10 +182,10 @@ def notice(inputs: Inputs, p: SafetyParameters) -> dict[Event, str]:
     )
     is_off = inputs.velocity_error_m_s > p.degraded_velocity_error_m_s or inputs.velocity_late_s > 0
     too_far_off = far_off and inputs.foreign_setpoints is None
-    off = f"the velocity is {inputs.velocity_error_m_s:.1f} m/s off the setpoints"
+    off = f"the velocity differs from its setpoints by {inputs.velocity_error_m_s:.1f} m/s"
     if inputs.velocity_late_s > 0:
         off = f"{off}, and follows them {inputs.velocity_late_s:.1f} s later than expected"
-    most = f"at most {p.max_velocity_error_m_s:g} m/s and {p.gate.reaction_s:g} s are flown"
+    most = f"limits: {p.max_velocity_error_m_s:g} m/s, {p.gate.reaction_s:g} s"
     cause = f"{off} ({most}): wind, or an autopilot that does not follow"
     room = f"the drone flies on to where no obstacle is within {p.hold_room_m:g} m, and asks for Hold there"
     ego_motion = {Event.EGO_MOTION_POOR: p.degraded_ego_motion_s, Event.EGO_MOTION_LOST: p.max_ego_motion_s}
@@ -218,7 +218,7 @@ def notice(inputs: Inputs, p: SafetyParameters) -> dict[Event, str]:
         (Event.NEIGHBOUR_CLOSE, not inputs.nearest_neighbour_m >= p.gate.min_separation_m, close),
         (Event.COMMAND_REFUSED, inputs.refused_commands > 0, "a command was not finite or far too large"),
         (Event.FENCE_LEFT, inputs.outside_fence, "outside the fence"),
-        (Event.HEIGHTS_LEFT, inputs.outside_heights, "above or below the heights allowed"),
+        (Event.HEIGHTS_LEFT, inputs.outside_heights, "outside the permitted heights"),
         (Event.LINK_LOST, lost_link is not None, f"{lost_link}"),
         *_older({Event.MOTION_UNKNOWN: services.MOTION.timeout}, inputs.motion_age_s, motion),
         (Event.STREAM_ENDED, lost_link is None and inputs.stream_fault is not None, ended),
@@ -226,7 +226,7 @@ def notice(inputs: Inputs, p: SafetyParameters) -> dict[Event, str]:
         (Event.NOT_OFFBOARD, inputs.flight_mode != OFFBOARD, f"the flight mode is {inputs.flight_mode or 'not known'}"),
         (Event.NOT_ARMED, not inputs.armed, "not armed"),
         (Event.NOT_IN_AIR, not inputs.in_air, "not in the air"),
-        (Event.BATTERY_LOW, inputs.battery_low, "the autopilot says that the battery is low"),
+        (Event.BATTERY_LOW, inputs.battery_low, "the autopilot reports a low battery"),
         (Event.POSITION_LOST, inputs.position_lost, "the autopilot has lost its position"),
         (Event.SHUTDOWN_ASKED, inputs.shutdown_asked, "flockd was asked to end"),
         (Event.HOLD_ASKED, inputs.hold_asked, "an operator asked for Hold"),
@@ -238,8 +238,8 @@ def notice(inputs: Inputs, p: SafetyParameters) -> dict[Event, str]:
 
 
 _FAILSAFE = (
-    "the autopilot is in its failsafe, and would take up any setpoint by itself; select Hold or Position, and offboard "
-    "once flockd is ready"
+    "the autopilot is in its failsafe and would follow any setpoint; select Hold or Position, then offboard once "
+    "flockd is ready"
 )
 
 

@@ -17,7 +17,7 @@ from flockd.flight.safety.request import Objection, Surroundings
 
 _NORMAL = NormalDist()
 BEYOND = _NORMAL.cdf(-2.0)
-"""Probability that a neighbour is nearer, or approaches faster, than it counts: 2.3 %, as two standard deviations."""
+"""Probability that a neighbour is nearer, or approaches faster, than assumed: 2.3 %, as for two standard deviations."""
 
 
 def surroundings(
@@ -34,12 +34,12 @@ def surroundings(
 ) -> Surroundings:
     """The surroundings `age_s` after the step that gave the `neighbours`, which fly on at constant velocity.
 
-    A neighbour that would have flown through the drone since then counts as where it was: such drones brake for each
-    other, and one that has really passed is seen behind in the next step. Unconfirmed tracks count: a track limits the
-    speed towards it from its first detection on, by its uncertainty. Each of its possible motions counts once, see
-    `_credible`. `moved` (3,) m NED is the drone's displacement since then; `position` (2,) m from home, `velocity` (3,)
-    m/s NED, NaN if not known; `obstacles` (m, 2) m from where the drone was then, and `seen_m` (SECTORS,); None: the
-    range of sight is not known.
+    A neighbour that would have flown through the drone since then is assumed at its last position: such drones brake
+    for each other, and one that has passed is detected behind the drone in the next step. Unconfirmed tracks count: a
+    track limits the speed towards it from its first detection on, by its uncertainty. Each of its possible motions
+    counts once, see `_credible`. `moved` (3,) m NED is the drone's displacement since then; `position` (2,) m from
+    home, `velocity` (3,) m/s NED, NaN if not known; `obstacles` (m, 2) m from where the drone was then, and `seen_m`
+    (SECTORS,); None: the range of sight is not known.
     """
     places, velocities, margins, unseen_s = _motions(neighbours, age_s, moved)
     return Surroundings(

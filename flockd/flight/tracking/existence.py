@@ -1,4 +1,4 @@
-"""Integrated probabilistic data association (IPDA): the probability that a track is of a drone at all.
+"""Integrated probabilistic data association (IPDA): the probability that a track is of a drone.
 
 D. Musicki, R. Evans, S. Stankovic, "Integrated probabilistic data association", IEEE Transactions on Automatic Control
 39(6), 1994, with one measurement a track, as the assignment is hard. `weight` (0 to 1) is how much of an independent
@@ -14,12 +14,12 @@ import numpy as np
 from flockd.core.config.tracking import TrackingParameters
 
 _SUREST = 0.999
-"""A network is taken for no surer than this."""
+"""Limit of a network's probability of a drone, and of its complement."""
 
 
 def begun(drone_probability: float, parameters: TrackingParameters) -> float:
-    """Of a new track from one detection: clutter is as much denser among doubtful detections as their odds are lower
-    than those that confirm a track."""
+    """The probability for a new track from one detection. Among doubtful detections clutter is denser by the ratio of
+    the odds that confirm a track to theirs."""
     doubt = _log_odds(drone_probability) - _log_odds(parameters.confirm_probability)
     return _bayes(parameters.birth_probability, min(doubt, 0.0))
 

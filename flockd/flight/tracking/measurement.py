@@ -29,7 +29,7 @@ class Measurement:
     size_m: float
     """As of `Detection.size_m`."""
     drone_probability: float = 1.0
-    """Probability that it is a drone at all, 0 to 1."""
+    """Probability that it is a drone, 0 to 1."""
     log_size_sigma: float = 0.0
     """As of `Detection`."""
 

@@ -218,8 +218,8 @@ class Tracker:
     def _misjudged(self, measured: Measurements, row: int, detected: set[int]) -> dict[int, int]:
         """A measurement without a track -> the undetected neighbour that fits its bearing and size, if any.
 
-        Either a stranger hides the neighbour, and was never seen beside it before, or, more often, the range is wrong.
-        So it is given to a neighbour that is confirmed and whose last detection was where it was expected.
+        Either an unknown drone hides the neighbour, or, more often, the range is wrong. So the measurement is assigned
+        to a neighbour that is confirmed and whose last detection was where it was expected.
         """
         known = [i for i, one in enumerate(self._tracks) if one.confirmed and one.agrees and i not in detected]
         if not known:

@@ -325,7 +325,7 @@ def write_lens(camera: str, lens: Lens, measured: MeasurementConfig, out: Path) 
         config = CameraConfig(name=camera, size_px=lens.camera.size, intrinsics=intrinsics)
     except ValidationError as error:
         fault = error.errors()[0]
-        told = f"the lens that fits cannot be true: {fault['loc'][-1]}: {fault['msg'].rpartition(';')[0]}"
+        told = f"the fitted lens is impossible: {fault['loc'][-1]}: {fault['msg'].rpartition(';')[0]}"
         raise CalibrationError(f"{told}; show the board in all corners of the image, from near and tilted") from None
     with written_whole(out) as draft:
         draft.write_text(rig_text((config,), comment), encoding="utf-8")

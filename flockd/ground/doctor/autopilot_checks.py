@@ -110,7 +110,7 @@ async def _ask(config: DroneConfig, parameters: AutopilotParameters, heard_s: fl
     try:
         found = [judge_heartbeat(link.system_id, link.status(), config)]
         if parameters.system_id is None:
-            measured = f"autopilot.system_id is not given: what is heard alone is flown, now system {link.system_id}"
+            measured = f"autopilot.system_id is not given: the only autopilot heard is used, system {link.system_id}"
             fix = "give each drone of the fleet another MAV_SYS_ID, and write this one's as autopilot.system_id"
             found.append(warned("system id", measured, fix))
         try:
@@ -118,7 +118,7 @@ async def _ask(config: DroneConfig, parameters: AutopilotParameters, heard_s: fl
         except AutopilotError as error:
             found.append(failed_from_error("firmware", str(error)))
             if not _is_silent(link.status(), config):
-                measured = "it is heard and does not respond: nothing reaches it, or it accepts signed messages only"
+                measured = "it sends, but does not respond: no message reaches it, or it accepts signed ones only"
                 fix = "check the cable's other direction; remove the signing key from its SD card"
                 return [*found, failed("signing", measured, fix)]
         found += await _parameters(link, config)
@@ -178,7 +178,7 @@ def judge_heartbeat(system_id: int, status: AutopilotStatus, config: DroneConfig
 def judge_refusals(refusals: Sequence[Refusal]) -> list[Finding]:
     """Why it could not be armed or fly offboard now."""
     if not refusals:
-        return [passed("arming", "its checks let it be armed and fly offboard")]
+        return [passed("arming", "it can be armed and fly offboard")]
     refused = [(f"refuses {refusal.refused}: " if refusal.refused else "", refusal) for refusal in refusals]
     return [failed("arming", f"{start}{refusal.what}", refusal.remedy) for start, refusal in refused]
 
@@ -219,7 +219,7 @@ def judge_parameter(name: str, value: float, config: DroneConfig) -> Finding:
         case "GF_MAX_VER_DIST":
             return _judge_limit(name, value, gate.max_height_m, "max_height_m")
         case "CP_DIST":
-            told = f"{value:g}; above 0 PX4 lets nobody fly in Position mode unless something sends it distances"
+            told = f"{value:g}; above 0 PX4 does not fly in Position mode without a sensor of distances"
             return graded(name, told, "set CP_DIST to -1, unless a sensor sends them", warning=value > 0)
     return _judge_action(name, ACTIONS[name], int(value), config)
 
@@ -263,7 +263,7 @@ def judge_range_finder(reading: RangeReading | None, arrivals_s: Sequence[float]
     """The newest reading of the range finder that faces down; ``arrivals_s``: arrival times of the last readings."""
     if reading is None:
         blame = failed if config.perception.height == "range_finder" else warned
-        fix = "see to the sensor, its driver and orientation (downward) in PX4, or write perception.height: barometer"
+        fix = "check the sensor, its driver and orientation (downward) in PX4, or write perception.height: barometer"
         return blame(RANGE_FINDER, "the autopilot sends no DISTANCE_SENSOR that faces down", fix)
     least_m, most_m = reading.min_m or 0.0, math.inf if reading.max_m is None else reading.max_m
     span_s = arrivals_s[-1] - arrivals_s[0] if arrivals_s else 0.0

@@ -71,7 +71,7 @@ def _judged(camera: CameraConfig, config: DroneConfig, watched: Watched | None) 
         problems += [finding for finding in found if finding.level is not Level.PASS]
         # The driver refuses controls that it does not accept; here is what was not even asked.
         if device and not device.pipeline and not any("exposure" in control.name for control in device.controls):
-            told = "its exposure is not configured: an automatic one blurs, which is taken for motion"
+            told = "its exposure is not configured: automatic exposure blurs, which looks like motion"
             fix = "set it in source.cameras[].controls, as in config/quadrotor.yaml"
             problems.append(warned(f"camera {camera.name}", told, fix))
         jitter_ms = 1e3 * watched.jitter_s()
@@ -196,14 +196,14 @@ def check_rig(config: DroneConfig, folder: Path | None, state_folder: Path = STA
     try:
         recording = Recording(newest)
         if recording.config.rig != config.rig:
-            yield passed("rig", f"is another than in the last flight, {newest.name}, which says nothing of it")
+            yield passed("rig", f"differs from that of the last flight, {newest.name}, which cannot be compared")
             return
         found = found_rig(recording, LAST_S)
     except (RecordingError, OSError) as error:
         yield warned("rig", f"its last flight could not be read: {error}", "delete it")
         return
     if not found:
-        yield passed("rig", f"the last flight, {newest.name}, was too short to say anything of it")
+        yield passed("rig", f"the last flight, {newest.name}, was too short for a comparison")
         return
     off = [one for one in found if rig_faults(one)]
     for one in off:
@@ -218,8 +218,8 @@ def check_rig(config: DroneConfig, folder: Path | None, state_folder: Path = STA
     unclear = (one for one in found if float(np.diag(one.covariance)[:3].min()) > _VAGUE_TURN_RAD**2)
     vague = [one.camera for one in unclear if one not in off]
     for camera in vague if len(vague) < len(found) else ():
-        told = f"the last flight, {newest.name}, shows nothing of its mounting, though it shows others'"
+        told = f"the last flight, {newest.name}, does not show its mounting, but others'"
         yield warned(f"camera {camera}", told, "look at `flockd cameras --picture`, and fly again")
     if not off:
         seen = len(found) - len(vague)
-        yield passed("rig", f"the last flight, {newest.name}, saw {seen} cameras as they are configured")
+        yield passed("rig", f"in the last flight, {newest.name}, {seen} cameras were as configured")

@@ -107,5 +107,5 @@ def judge_steps(config: DroneConfig, timed: list[tuple[float, PilotOutput]], bus
     if too_much:
         measured += ": above safety.degraded_load, so it would always fly slowly"
     elif much:
-        measured += ": little is left for what else the computer does"
+        measured += ": little time is left for other programs"
     return graded("step", measured, fix, failure=too_much, warning=much)

@@ -29,7 +29,7 @@ def check_limits(config: DroneConfig) -> Iterator[Finding]:
         measured, _, fix = text.partition("; ")
         yield warned(key_text(key), measured, fix)
     if config.perception.drone_size_m is None and config.flocking.size == "off":
-        measured = "nobody says it: ranges follow from what the networks judge, often a quarter off for new airframes"
+        measured = "not given: the networks' estimate gives ranges, often a quarter wrong for unknown airframes"
         fix = "measure the drones from tip to tip and write perception.drone_size_m, or flocking.size: learn"
         yield warned("drone size", measured, fix)
 
@@ -60,7 +60,7 @@ def check_fleet(config: DroneConfig, listen_s: float = LISTEN_S) -> Iterator[Fin
     seen = f"sees {', '.join(names)}" if names else "sees no other drone"
     if wanted.connect and not reached:
         measured = f"nothing listens at {', '.join(wanted.connect)}"
-        fix = "start what is to listen there (a router, `flockd status --listen`), or fix telemetry.connect"
+        fix = "start the program that listens there (a router, `flockd status --listen`), or fix telemetry.connect"
         yield warned("zenoh", measured, fix)
     else:
         yield passed("zenoh", f"fleet {wanted.fleet} at {where}: {seen}")

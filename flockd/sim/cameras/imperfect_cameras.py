@@ -16,33 +16,33 @@ _Late = Annotated[float, Field(ge=0, le=MAX_LATE_S)]
 
 
 class ShutterConfig(Section):
-    """When the rows of an image are exposed."""
+    """Exposure of an image's rows."""
 
     exposure_s: Annotated[float, Field(ge=0, le=0.1)] = 0.0
-    """Exposure of each row: what moves is smeared along its way in that time."""
+    """Exposure time of each row; motion in this time blurs the image."""
     readout_s: Annotated[float, Field(ge=0, le=0.1)] = 0.0
-    """From the exposure of the first row to that of the last, one row after the other (rolling shutter); 0: all at
-    once (global shutter). An image shows the middle row at its time."""
+    """Time from the exposure of the first row to that of the last (rolling shutter); 0: all at once (global shutter).
+    An image's time is that of its middle row."""
     readout_from: Literal["top", "right", "left"] = "top"
-    """Where the sensor's first row is in the upright image: of a camera on its side (`turn_deg` 90, 270) at the right,
-    at the left."""
+    """Side of the sensor's first row in the upright image: for a camera on its side right (`turn_deg` 90) or left
+    (270)."""
 
 
 class ShakeConfig(Section):
-    """How propellers shake each camera on its mounting: angles about its three axes, of seeded phases."""
+    """Shake of each camera by the propellers: angles about its three axes, with phases from the seed."""
 
     rms_deg: Annotated[float, Field(ge=0, le=5)] = 0.0
     """Root mean square of the angle about each axis."""
     frequency_hz: Annotated[float, Field(ge=1, le=1000)] = 100.0
-    """Revolutions of the propellers each second: four tones within 10 % of it hold 80 % of the power, the passing of
-    two blades, at twice the frequency, the rest."""
+    """Revolutions of the propellers per second. Four tones within 10 % of it have 80 % of the power; the rest is at
+    twice the frequency, at which the two blades pass."""
 
 
 class SensorNoiseConfig(Section):
-    """Noise of the image sensor by its gain (EMVA 1288): shot noise of electrons, and noise of reading them out."""
+    """Noise of the image sensor by its gain (EMVA 1288): shot noise and read noise."""
 
     gain: Annotated[float, Field(ge=0, le=1000)] = 0.0
-    """Amplification over that at which a full well is white; 0: the same noise everywhere, `sensors.image_noise`."""
+    """Amplification relative to that at which a full well is white; 0: uniform noise, `sensors.image_noise`."""
     full_well_e: Positive = 4300.0
     """Electrons that a pixel holds."""
     read_noise_e: NonNegative = 1.7
@@ -50,43 +50,43 @@ class SensorNoiseConfig(Section):
 
 
 class LensFaultsConfig(Section):
-    """What is in the glass."""
+    """Faults of the lens."""
 
     flare: Share = 0.0
-    """Share of the light that is scattered over the image, the sun's included where the lens sees it (veiling glare
-    index, ISO 9358): half of the sun's evenly, half around it."""
+    """Share of scattered light (veiling glare index, ISO 9358), with the sun's if it is in view: half of the sun's
+    light evenly over the image, half around the sun."""
 
 
 class CompressionConfig(Section):
-    """Compression of each image by itself, as a camera of pixel format `mjpeg` sends it."""
+    """Compression of each image, as by a camera of pixel format `mjpeg`."""
 
     jpeg_quality: Annotated[int, Field(ge=1, le=100)] | None = None
     """null: none."""
 
 
 class CameraTimingConfig(Section):
-    """When cameras expose, and what becomes of the images."""
+    """Times of exposure, delays and losses of images."""
 
     apart_s: _Late = 0.0
-    """Cameras run freely: each exposes up to this much before the set's time, and its time stamps say so."""
+    """Free-running cameras: each exposes up to this time before the set's time, with correct time stamps."""
     delay_s: _Late = 0.0
-    """Images are older by this than their time stamps say."""
+    """Time by which images are older than their time stamps."""
     jitter_s: _Late = 0.0
-    """Each image is older by up to this much more, at random."""
+    """Largest additional age of each image, at random."""
     dropped: Share = 0.0
-    """Share of the images that never come."""
+    """Share of lost images."""
 
 
 class RigErrorsConfig(Section):
-    """Errors of each camera of each drone, in a direction of its own, drawn from the seed; pilots do not know of them.
-    Wrong time stamps: `timing.delay_s`."""
+    """Calibration errors of each camera of each drone, in random directions from the seed. For wrong time stamps use
+    `timing.delay_s`."""
 
     mounting_deg: Annotated[float, Field(ge=0, le=20)] = 0.0
-    """Its mounting is turned by this angle about some axis."""
+    """Angle by which its mounting is turned about a random axis."""
     mounting_m: Annotated[float, Field(ge=0, le=0.5)] = 0.0
-    """Its mounting is displaced by this distance."""
+    """Distance by which its mounting is displaced."""
     focal: Annotated[float, Field(ge=0, le=0.2)] = 0.0
-    """Its focal lengths are longer or shorter by this share."""
+    """Share by which its focal lengths are longer or shorter."""
 
 
 _PRESETS: Mapping[CameraPreset, Mapping[str, Mapping[str, Any]]] = {
@@ -113,8 +113,8 @@ _PRESETS: Mapping[CameraPreset, Mapping[str, Mapping[str, Any]]] = {
 class CamerasConfig(Section):
     """Cameras as a real drone has them. The lens is that of the drone's own rig.
 
-    A preset gives the values that are not written here: `preset: realistic` with `shutter: {readout_s: 0}` is a
-    realistic camera with a global shutter.
+    The preset gives all other values: `preset: realistic` with `shutter: {readout_s: 0}` is a realistic camera with a
+    global shutter.
     """
 
     preset: CameraPreset = "ideal"
@@ -126,8 +126,8 @@ class CamerasConfig(Section):
     lens: LensFaultsConfig = LensFaultsConfig()
     compression: CompressionConfig = CompressionConfig()
     reduce: Literal[1, 2, 4] = 1
-    """As in a drone's `source.cameras`: the sensor has this many times the pixels either way, each as noisy as `noise`
-    says, and the compressed image is reduced."""
+    """As in a drone's `source.cameras`: the sensor has more pixels in each direction by this factor, each with `noise`,
+    and the compressed image is reduced."""
     timing: CameraTimingConfig = CameraTimingConfig()
     rig: RigErrorsConfig = RigErrorsConfig()
 

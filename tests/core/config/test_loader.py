@@ -415,7 +415,7 @@ def test_how_wide_a_camera_sees() -> None:
             (640, 480),
             {"distortion": (0.1,) * 8},
             "distortion",
-            "has 8 coefficients, and those of pinhole are none, or k1",
+            "has 8 coefficients; pinhole takes none, or k1",
         ),
         ((640, 480), {"model": "wide_angle", "distortion": (0.1,) * 5}, "distortion", "has 5 coefficients"),
         ((640, 480), {"fx": 1.019, "fy": 1.0, "cx": 320.0}, "fx", "shows no direction at the border of 640 x 480"),

@@ -20,8 +20,8 @@ from flockd.flight.geometry.ground_fit import REACH
 from flockd.flight.perception import Observation
 
 MATCHES = 1200
-"""Matched points of each image; four times as many did not improve the scale. At 640x480 pixels, these are the points
-at which the flow is refined."""
+"""Number of matched points of each image; four times as many did not improve the scale. At 640x480 pixels, these are
+the points at which the flow is refined."""
 MIN_BASELINE_M = 0.08
 """Shortest baseline across the line of sight; below it the depth of the ground is noise."""
 
