@@ -19,6 +19,7 @@ from flockd.core.messages import MissionOrder
 from flockd.fleet.drone_rows import drone_rows, history_row, status_rows
 from flockd.fleet.simulation import CONTROLS, MAX_GUST_M_S, MAX_SPEED, MIN_SPEED, SimulationMessage
 from flockd.fleet.watcher import FleetWatcher
+from flockd.flight.safety import State
 from flockd.onboard.daemon.operator_orders import OperatorCommands, OperatorRequests
 from flockd.onboard.message_json import from_json
 from flockd.onboard.telemetry.topics import TOPICS
@@ -103,7 +104,10 @@ def test_a_changed_command_is_refused_or_carried_out_as_it_stands() -> None:
         payload = random.choice(seeds)
         if random.random() < 0.7:
             payload = mutated_bytes(random, payload)
-        commands = OperatorCommands(allowed, requests, missions, loop, said.append, identity="d", clock=lambda: 8.0)
+        commands = OperatorCommands(
+            allowed, requests, missions, loop, said.append,
+            state=lambda: State.NORMAL, identity="d", clock=lambda: 8.0,
+        )  # fmt: skip
         reply = commands.handle(command, payload)
         loop.call_soon(loop.stop)
         loop.run_forever()

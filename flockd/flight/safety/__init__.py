@@ -7,9 +7,10 @@ from flockd.flight.safety.fence import outside_fence, outside_heights
 from flockd.flight.safety.gate import Gate
 from flockd.flight.safety.policy import Action
 from flockd.flight.safety.request import Objection, Permission, Request, Surroundings, Verdict
-from flockd.flight.safety.supervisor import Decision, State, Supervisor
+from flockd.flight.safety.supervisor import FLYING, Decision, State, Supervisor
 
 __all__ = [
+    "FLYING",
     "OFFBOARD",
     "Action",
     "CameraHealth",

@@ -33,7 +33,7 @@ class State(StrEnum):
     """Handed over: the pilot or the autopilot flies."""
 
 
-_FLYING = frozenset({State.NORMAL, State.DEGRADED, State.HOVER, State.ASKING})
+FLYING = frozenset({State.NORMAL, State.DEGRADED, State.HOVER, State.ASKING})
 _ACTIONS = {
     State.IDLE: Action.SILENCE,
     State.READY: Action.OFFER,
@@ -96,7 +96,7 @@ class Supervisor:
         self._now_s = now_s
         noticed = notice(inputs, self._parameters)
         self._since_s = {event: self._since_s.get(event, now_s) for event in noticed}
-        if self._state in _FLYING:
+        if self._state in FLYING:
             self._fly(noticed)
         else:
             landed = inputs.armed is False and inputs.in_air is False
@@ -164,7 +164,7 @@ class Supervisor:
 
     def _reasons(self, noticed: dict[Event, str]) -> tuple[Reason, ...]:
         def gravity(event: Event) -> int:
-            return self._reaction(event) if self._state in _FLYING else self._rules[event].barrier
+            return self._reaction(event) if self._state in FLYING else self._rules[event].barrier
 
         now = {event: noticed[event] for event in sorted(noticed, key=gravity, reverse=True)}
         return tuple(Reason(event, sentence) for event, sentence in {**self._latched, **now}.items())

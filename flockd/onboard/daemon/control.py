@@ -14,6 +14,7 @@ from flockd.core.config import DroneConfig
 from flockd.core.messages import VehicleState, Wanted
 from flockd.flight.obstacles import nearest_points
 from flockd.flight.safety import (
+    FLYING,
     Action,
     Decision,
     Event,
@@ -34,7 +35,6 @@ from flockd.onboard.daemon.pilot_loop import PilotLoop, VehicleHistory
 from flockd.onboard.daemon.supervisor_inputs import InputCollector, position_from_home
 
 PERIOD_S = services.CONTROL.period_s
-FLYING = frozenset({State.NORMAL, State.DEGRADED, State.HOVER, State.ASKING})
 _TAKEOVERS: dict[Action, Takeover] = {Action.ASK_HOLD: "hold", Action.ASK_RETURN: "return", Action.ASK_LAND: "land"}
 
 

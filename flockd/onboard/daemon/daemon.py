@@ -15,7 +15,7 @@ from flockd.core.errors import ConfigError, FlockdError
 from flockd.core.secrets import masked
 from flockd.flight.geometry import build_rig
 from flockd.flight.perception import OneByOne
-from flockd.flight.safety import Decision, Event, Gate, State
+from flockd.flight.safety import FLYING, Decision, Event, Gate, State
 from flockd.onboard.autopilot.autopilot_status import AutopilotError
 from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
 from flockd.onboard.autopilot.streamer import SetpointStreamer
@@ -26,7 +26,7 @@ from flockd.onboard.daemon.autopilot_tasks import (
     StateTexts,
     state_sentence,
 )
-from flockd.onboard.daemon.control import FLYING, Control
+from flockd.onboard.daemon.control import Control
 from flockd.onboard.daemon.message_sinks import MessageSinks
 from flockd.onboard.daemon.operator_orders import MissionOrders, OperatorCommands, OperatorRequests
 from flockd.onboard.daemon.pilot_loop import PilotLoop, VehicleHistory
@@ -150,11 +150,12 @@ class Daemon:
         control = Control(
             config, link, streamer, pilot_loop, collector, requests, history, self._operator, self._on_tick, clock
         )  # fmt: skip
-        missions = MissionOrders(config, pilot_loop, link.vehicle_state, lambda: control.decision.state)
+        missions = MissionOrders(config, pilot_loop, link.vehicle_state)
         loop = asyncio.get_running_loop()
         commands = OperatorCommands(
-            config.telemetry.commands, self._operator, missions, loop, sinks.event, identity=telemetry.identity
-        )
+            config.telemetry.commands, self._operator, missions, loop, sinks.event,
+            state=lambda: control.decision.state, identity=telemetry.identity,
+        )  # fmt: skip
         previews = Previews(build_rig(config.rig), lambda: (pilot_loop.frames, pilot_loop.stepped))
         about = AboutMessage(
             version=__version__,

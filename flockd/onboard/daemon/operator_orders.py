@@ -14,13 +14,15 @@ from flockd.core import services
 from flockd.core.config import DroneConfig
 from flockd.core.messages import MissionOrder, VehicleState
 from flockd.flight.mission import order_fault
-from flockd.flight.safety import State
+from flockd.flight.safety import FLYING, State
 from flockd.onboard.daemon.pilot_loop import PilotLoop
 from flockd.onboard.telemetry.order_messages import parse_ask, parse_order
 from flockd.onboard.telemetry.topics import AnswerMessage, AskMessage, TakenOrderMessage
 
 ORDERS = frozenset({"goto", "velocity"})
 """Commands that change the mission."""
+_TAKES_ORDERS = FLYING - {State.ASKING}
+_NOT_FLYING = "flockd does not fly the drone now, as its state is {}"
 
 
 @dataclass
@@ -64,11 +66,13 @@ class OperatorCommands:
         loop: asyncio.AbstractEventLoop,
         log_event: Callable[[str], None],
         *,
+        state: Callable[[], State],
         identity: str,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """``identity`` and ``clock``: those that the drone publishes."""
+        """``state``: the supervisor's, on any thread; ``identity`` and ``clock``: those that the drone publishes."""
         self._allowed, self._requests, self._missions, self._loop = allowed, requests, missions, loop
+        self._state = state
         self._checks = OrderChecks(identity, clock)
         self.recent = self._checks.recent
         self._taken = _Limited(log_event, burst=60, refill_s=1.0, clock=clock)
@@ -91,12 +95,18 @@ class OperatorCommands:
             self._refusals.tell(f"an operator's command{operator} was refused: {error}")
             return AnswerMessage(accepted=False, sentence=str(error))
         self._taken.tell(f"an operator asked for {command}: {ask['operator']}, order {ask['sequence']}")
-        return AnswerMessage(accepted=True, sentence=f"{command} is being tried; the drone's state shows the result")
+        sentence = f"{command} is being tried; the drone's state shows the result"
+        if command in SAFE and (state := self._state()) not in FLYING:
+            sentence = f"{_NOT_FLYING.format(state)}: the pilot has to do it; flockd begins no flight before `resume`"
+        return AnswerMessage(accepted=True, sentence=sentence)
 
     def _apply(self, command: str, ask: AskMessage) -> None:
         """Applies a command. Raises ValueError with the reason if it is refused."""
         order = parse_order(command, ask["order"]) if command in ORDERS else None
-        fault = self._checks.fault(command, ask) or (None if order is None else self._missions.fault(order))
+        fault = self._checks.fault(command, ask)
+        if order is not None and fault is None:
+            told = f"{_NOT_FLYING.format(state := self._state())}; its mission begins with the flight"
+            fault = self._missions.fault(order) if state in _TAKES_ORDERS else told
         if fault is not None:
             raise ValueError(fault)
         self._checks.take(command, ask)
@@ -201,9 +211,6 @@ class OrderChecks:
         ]
 
 
-_TAKES_ORDERS = frozenset({State.NORMAL, State.DEGRADED, State.HOVER})
-
-
 class MissionOrders:
     """Implements `Missions`."""
 
@@ -212,16 +219,12 @@ class MissionOrders:
         config: DroneConfig,
         pilot_loop: PilotLoop,
         vehicle: Callable[[], VehicleState | None],
-        state: Callable[[], State],
     ) -> None:
-        """``vehicle``: the vehicle's newest state; ``state``: the supervisor's. Both may be called on any thread."""
-        self._config, self._pilot_loop, self._vehicle, self._state = config, pilot_loop, vehicle, state
+        """``vehicle``: the vehicle's newest state, on any thread."""
+        self._config, self._pilot_loop, self._vehicle = config, pilot_loop, vehicle
 
     def fault(self, order: MissionOrder) -> str | None:
         """Why an order is refused, one sentence; None: it is accepted. On any thread."""
-        state = self._state()
-        if state not in _TAKES_ORDERS:
-            return f"flockd does not fly the drone now, as its state is {state}; its mission begins with the flight"
         return order_fault(self._config, order, self._vehicle())
 
     def apply(self, order: MissionOrder) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from flockd.core.messages import MissionOrder
+from flockd.flight.safety import State
 from flockd.onboard.daemon.operator_orders import LATEST_S, MOST_SESSIONS, RECENT_S, OperatorCommands, OperatorRequests
 from flockd.onboard.telemetry.topics import AnswerMessage
 
@@ -22,13 +23,14 @@ class Drone:
     """Takes every order that the checks let through; its clock is set by hand."""
 
     def __init__(self) -> None:
-        self.now_s = 1000.0
+        self.now_s, self.state = 1000.0, State.NORMAL
         self.said: list[str] = []
         self.goals: list[MissionOrder] = []
         self.requests, self.loop = OperatorRequests(), asyncio.new_event_loop()
         self.commands = OperatorCommands(
-            ALLOWED, self.requests, self, self.loop, self.said.append, identity="1f", clock=lambda: self.now_s
-        )
+            ALLOWED, self.requests, self, self.loop, self.said.append,
+            state=lambda: self.state, identity="1f", clock=lambda: self.now_s,
+        )  # fmt: skip
 
     def fault(self, order: MissionOrder) -> None:
         """None is refused."""
@@ -62,6 +64,19 @@ def test_an_order_is_taken_once_and_says_who_gave_it(drone: Drone) -> None:
     assert not drone.order("goto", 0)["accepted"], "an earlier one that came late"
     assert drone.order("goto", 2)["accepted"]
     assert [goal.place.tolist() for goal in drone.goals if goal.place is not None] == [[3.0, 1.0]]
+
+
+@pytest.mark.parametrize("state", State)
+def test_what_is_not_tried_is_not_said_to_be(drone: Drone, state: State) -> None:
+    """A drone that the pilot or the autopilot flies is not landed by flockd. But it begins no flight any more."""
+    drone.state = state
+    flown = state.value in {"normal", "degraded", "hover", "asking"}
+    for number, command in enumerate(("land", "hold")):
+        answer = drone.order(command, number)
+        assert answer["accepted"] and drone.requests.__dict__[command]
+        assert ("is being tried" in answer["sentence"]) is flown
+        assert (f"does not fly the drone now, as its state is {state}: " in answer["sentence"]) is not flown
+    assert drone.order("goto", 2)["accepted"] is (flown and state.value != "asking")
 
 
 @pytest.mark.parametrize(("age_s", "taken"), [(0.0, True), (4.9, True), (5.1, False), (-0.4, True), (-0.6, False)])

@@ -20,6 +20,7 @@ from flockd.core.errors import ConfigError
 from flockd.core.printable import printable
 from flockd.fleet.drone_rows import status_rows
 from flockd.fleet.watcher import MAX_BYTES, MAX_DRONES, MAX_EVENTS_OF_ONE, FleetWatcher, Heard, Watched
+from flockd.flight.safety import State
 from flockd.onboard.daemon.operator_orders import OperatorCommands, OperatorRequests
 from flockd.onboard.message_json import from_json
 from flockd.onboard.telemetry.publisher import ZenohTelemetry
@@ -204,7 +205,10 @@ def test_two_drones_of_one_name_are_told_apart_by_identity_and_neither_gets_an_o
 
     def commands(telemetry: ZenohTelemetry, loop: asyncio.AbstractEventLoop) -> None:
         requests, missions = OperatorRequests(), cast("Any", None)
-        handler = OperatorCommands(["hold"], requests, missions, loop, asked.append, identity=telemetry.identity)
+        identity = telemetry.identity
+        handler = OperatorCommands(
+            ["hold"], requests, missions, loop, asked.append, state=lambda: State.NORMAL, identity=identity
+        )
         about = AboutMessage(version="1", configuration={}, commands=["hold"])
         telemetry.announce("d", about, handler.handle, lambda camera: None)
 
