@@ -52,11 +52,11 @@ class DroneQueries:
         """The answer to an operator's command. ``identity``: of the drone's liveliness token.
 
         First it queries the drone's clock, repeatedly, because a new connection does not know the drone's keys yet. It
-        sends the command once.
+        sends the command once, with the time of this call on that clock: on a bad link a later command may overtake it.
         """
-        until_s, session = time.monotonic() + ANSWER_S, self._orders
+        given_s, session = time.monotonic(), self._orders
         while (now := self.message(f"{drone}/time", TimeMessage, session=session)) is None:
-            if time.monotonic() >= until_s:
+            if time.monotonic() >= given_s + ANSWER_S:
                 return None
             session = self._session if session is self._orders else self._orders  # one may not be connected yet
             time.sleep(AGAIN_S)
@@ -65,7 +65,7 @@ class DroneQueries:
             operator=operator,
             session=self._name,
             sequence=next(self._numbers),
-            time_s=now["time_s"],
+            time_s=now["time_s"] - (time.monotonic() - given_s),
             order=None if order is None else {**order},
         )
         payload = json.dumps(ask, allow_nan=False).encode()

@@ -253,7 +253,7 @@ class AskMessage(TypedDict):
     sequence: int
     """Increases within the session."""
     time_s: float
-    """The drone's own clock, by its reply to `time` just before."""
+    """When the operator gave it, on the drone's own clock, by its reply to `time` just before."""
     order: dict[str, object] | None
     """An `OrderMessage` for `goto` and `velocity`; else null."""
 
