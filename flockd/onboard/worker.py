@@ -10,6 +10,8 @@ from concurrent.futures import Future, wait
 from contextlib import suppress
 from typing import Any, TypeVar
 
+from flockd.core.errors import UnavailableError
+
 T = TypeVar("T")
 
 GOLDEN_S = 8.0
@@ -18,7 +20,7 @@ _END_S = 1.0
 """Longest time for work to end when it is stopped; ONNX Runtime takes a few milliseconds."""
 
 
-class LateError(Exception):
+class LateError(UnavailableError):
     """A job missed its deadline; it may still be running."""
 
 
@@ -52,7 +54,7 @@ class Worker:
         except TimeoutError as error:
             if not deadline.expired():
                 raise
-            raise LateError(f"{self._name}: not done within {deadline_s:g} s") from error
+            raise LateError(f"{self._name}: not done within {deadline_s:g} s; check disk and load") from error
 
     def leave(self, timeout_s: float = 0.0) -> None:
         """Lets the thread end after its present job, and waits up to ``timeout_s``. If it hangs, the process ends it.

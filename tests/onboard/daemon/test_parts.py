@@ -21,7 +21,7 @@ from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.config.drone import DroneConfig
 from flockd.core.config.source import SourceParameters
 from flockd.core.data import data_path
-from flockd.core.errors import ModelError
+from flockd.core.errors import FlockdError, ModelError
 from flockd.core.messages import (
     EgoMotion,
     Frame,
@@ -428,8 +428,11 @@ async def test_a_disk_that_takes_its_time_to_end_a_recording_delays_no_telemetry
     await sinks.close()
 
 
+@pytest.mark.parametrize(
+    ("load_s", "told"), [(60.0, "it is damaged"), (0.1, r"loading: not done within 0\.1 s; check disk and load")]
+)
 async def test_a_link_that_is_there_before_the_networks_fail_to_load_is_closed(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    load_s: float, told: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """So that a serial port is given back: the process may live on, and the next one needs it."""
     closed = asyncio.Event()
@@ -445,9 +448,10 @@ async def test_a_link_that_is_there_before_the_networks_fail_to_load_is_closed(
         raise ModelError("it is damaged")
 
     monkeypatch.setattr(AutopilotLink, "connect", connect)
+    monkeypatch.setattr("flockd.onboard.daemon.daemon.LOAD_S", load_s)
     config = config_for(14540, free_endpoint(), free_endpoint())
     service = ServiceManager({})
     daemon = Daemon(config, "x.yaml", load_networks=fail, models={}, recordings=None, service=service)
-    with pytest.raises(ModelError):
+    with pytest.raises(FlockdError, match=told):
         await daemon.run()
     assert closed.is_set()
