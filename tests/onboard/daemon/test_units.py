@@ -12,7 +12,7 @@ import pytest
 from flockd.cli import main
 from flockd.core.config.safety import SafetyParameters
 from flockd.onboard.autopilot import streamer
-from flockd.onboard.daemon import daemon
+from flockd.onboard.daemon import autopilot_tasks, daemon
 
 UNITS = Path(__file__).parents[3] / "systemd"
 NAMES = ("flockd.service", "flockd@.service")
@@ -58,12 +58,20 @@ def test_it_starts_a_command_that_there_is(name: str, capsys: pytest.CaptureFixt
 
 
 @pytest.mark.parametrize("name", NAMES)
+def test_it_may_open_the_serial_ports_of_the_computers_that_it_is_installed_on(name: str) -> None:
+    """By the names of Linux's drivers: of a PC, a Raspberry Pi, a Jetson, and on USB, an autopilot and an adapter."""
+    allowed = set((UNITS / name).read_text(encoding="utf-8").splitlines())
+    assert {f"DeviceAllow=char-tty{port} rw" for port in ("S", "AMA", "THS", "ACM", "USB")} <= allowed
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_the_service_manager_waits_for_the_longest_end(name: str) -> None:
-    """Hold that is not confirmed, and then each part of the drone hangs until its own deadline; and with a dead control
-    loop nothing feeds the watchdog while the autopilot is asked for Hold."""
+    """Hold or a landing that is not confirmed, and then each part of the drone hangs until its own deadline; and with a
+    dead control loop nothing feeds the watchdog while the autopilot is asked for Hold."""
     unit = dict(line.partition("=")[::2] for line in (UNITS / name).read_text(encoding="utf-8").splitlines())
     on_workers, on_the_loop = 3, 2  # frames, pilot and telemetry; link and recording
-    ends_s = SafetyParameters().ask_timeout_s + streamer.CLOSE_TIMEOUT_S
+    landing_s = autopilot_tasks.FROM_HOLD_S + autopilot_tasks.RETRY_S + autopilot_tasks.REPLY_S
+    ends_s = max(SafetyParameters().ask_timeout_s, landing_s) + streamer.CLOSE_TIMEOUT_S
     ends_s += on_workers * daemon.CLOSE_S + on_the_loop * 2 * daemon.CLOSE_S
     assert ends_s + 1.0 < float(unit["TimeoutStopSec"])
     assert float(unit["WatchdogSec"]) > daemon.HOLD_S + 0.1
