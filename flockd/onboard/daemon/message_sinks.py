@@ -51,8 +51,8 @@ class MessageSinks:
     def publish(self, topic: str, message: Mapping[str, object]) -> None:
         """Publishes one message; see `flockd.onboard.telemetry.TOPICS`."""
         self._submit(self._telemetry.publish, self._config.name, topic, message)
-        if self._recorder is not None:
-            self._recorder.publish(self._config.name, topic, message)
+        if (recorder := self._recorder) is not None:  # the event loop may end it meanwhile
+            recorder.publish(self._config.name, topic, message)
 
     def step(self, frames: FrameSet, vehicle: VehicleState, output: PilotOutput, order: MissionOrder | None) -> None:
         """Publishes and records one step of the pilot."""

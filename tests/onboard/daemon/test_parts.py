@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -426,6 +427,18 @@ async def test_a_disk_that_takes_its_time_to_end_a_recording_delays_no_telemetry
     assert await asyncio.to_thread(heard.wait, 5.0)
     ended.set()
     await sinks.close()
+
+
+async def test_a_message_of_another_thread_as_a_recording_ends_is_no_error() -> None:
+    """Of an operator, whose order would get no answer."""
+    recorders = iter([Mock(), None])
+
+    class Ending(MessageSinks):
+        _recorder: Any = property(lambda self: next(recorders), lambda self, value: None)
+
+    sinks = Ending(_flyable("front"), Mock(), {}, None, lambda: 0.0)
+    sinks.event("an operator asked for hold")
+    assert list(recorders) == [None], "it was looked up once"
 
 
 @pytest.mark.parametrize(
