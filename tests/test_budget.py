@@ -21,7 +21,7 @@ from flockd.onboard.recording.reader import Recording
 ROOT = Path(__file__).parents[1]
 LINES = {
     "flockd/core": 3_310,
-    "flockd/flight": 10_090,
+    "flockd/flight": 10_050,
     "flockd/onboard": 9_360,
     "flockd/fleet": 2_740,
     "flockd/ground": 5_230,

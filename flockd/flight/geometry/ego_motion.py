@@ -48,7 +48,7 @@ def estimate_ego_motion(pairs: PointPairs, rig: Rig, interval_s: float, paramete
         max_threshold=parameters.max_threshold_m,
     )
     motion = found.transform
-    by_camera = [(camera, pairs.select(pairs.camera_names == name)) for name, camera in rig.cameras.items()]
+    by_camera = [(camera, pairs[pairs.camera_names == name]) for name, camera in rig.cameras.items()]
     explained = _explained(by_camera, motion) / len(pairs)
     if parameters.refine:
         refined = refine_ego_motion(pairs, rig, motion, found.inliers)

@@ -48,7 +48,7 @@ def refine_ego_motion(
     """
     if len(pairs) > _MAX_PAIRS:
         drawn = np.sort(np.random.default_rng(0).choice(len(pairs), _MAX_PAIRS, replace=False))
-        pairs, agreeing = pairs.select(drawn), agreeing[drawn]
+        pairs, agreeing = pairs[drawn], agreeing[drawn]
     typical = np.concatenate([agreeing, agreeing])  # both ways
     if not typical.any():
         return None

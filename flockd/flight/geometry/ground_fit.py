@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flockd.core.messages import BoolArray, FloatArray
+from flockd.core.messages import FloatArray
+from flockd.flight.geometry.pairs import Columns
 from flockd.flight.geometry.robust.kernels import median, tukey
 
 RELIEF = 0.03
@@ -25,7 +26,7 @@ MEDIAN_DEVIATIONS = 6.0
 
 
 @dataclass(frozen=True, eq=False)
-class GroundSamples:
+class GroundSamples(Columns):
     """Points by direction and inverse range, in level axes with the drone at the origin."""
 
     rays: FloatArray
@@ -36,15 +37,6 @@ class GroundSamples:
     """(n, 3) NED, of the camera from the body's origin, in the same unit as the range."""
     sigma: FloatArray
     """(n,) standard deviation of `inverse`."""
-
-    def select(self, chosen: BoolArray) -> GroundSamples:
-        """The samples of a mask (n,)."""
-        return GroundSamples(*(column[chosen] for column in vars(self).values()))
-
-    @staticmethod
-    def concatenate(parts: list[GroundSamples]) -> GroundSamples:
-        """All samples of several."""
-        return GroundSamples(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
 
 
 def fit_ground(samples: GroundSamples, height: float, slope: FloatArray, place: FloatArray) -> tuple[float, FloatArray]:
@@ -66,7 +58,7 @@ def fit_ground(samples: GroundSamples, height: float, slope: FloatArray, place: 
     near = (away < REACH) & (np.abs(samples.inverse - expected) < NEAR_EXPECTED * expected)
     if near.sum() < MIN_POINTS:
         raise ValueError("too little ground is seen to fit a plane")
-    ground = samples.select(near)
+    ground = samples[near]
     spread = np.hypot(ground.sigma, RELIEF * (1.0 + away[near]) * expected[near])
     # A point at inverse range w is on the plane if n . (ray + w offset) = w height: linear in height and slope.
     x, y, z = (ground.rays + ground.inverse[:, None] * ground.offsets).T

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, TypeVar
+from dataclasses import dataclass, replace
+from typing import Any, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flockd.core.messages import BoolArray, Float32Array, FloatArray, IntArray
+from flockd.core.messages import Float32Array, FloatArray
 from flockd.flight.geometry.depth_maps import RangeMap
 from flockd.flight.geometry.rig import RigCamera
 
@@ -18,7 +18,22 @@ _DEPTH_AGREEMENT = 0.05
 
 
 @dataclass(frozen=True, eq=False)
-class PointPairs:
+class Columns:
+    """A value whose fields are arrays of equal length; to inherit from."""
+
+    def __getitem__(self, which: Any) -> Self:
+        """The rows of a mask or of indices."""
+        return replace(self, **{name: column[which] for name, column in vars(self).items()})
+
+    @classmethod
+    def concatenate(cls, several: Sequence[Self]) -> Self:
+        """The rows of one or more, in order."""
+        names = vars(several[0])
+        return replace(several[0], **{name: np.concatenate([vars(one)[name] for one in several]) for name in names})
+
+
+@dataclass(frozen=True, eq=False)
+class PointPairs(Columns):
     """n background points seen at an interval's start (in body frame C) and at its end (in body frame F)."""
 
     previous: FloatArray
@@ -34,20 +49,6 @@ class PointPairs:
 
     def __len__(self) -> int:
         return len(self.previous)
-
-    def select(self, which: BoolArray | IntArray) -> PointPairs:
-        """The pairs of a mask (n,) or of indices."""
-        places = which.nonzero()[0] if which.dtype == np.bool_ else which
-        return PointPairs(*[column.take(places, axis=0) for column in self._columns()])
-
-    @staticmethod
-    def concatenate(several: Sequence[PointPairs]) -> PointPairs:
-        """All pairs in order. Raises ValueError for an empty sequence."""
-        return PointPairs(*map(np.concatenate, zip(*[pairs._columns() for pairs in several], strict=True)))
-
-    def _columns(self) -> tuple[NDArray[Any], ...]:
-        """In the order of the constructor."""
-        return tuple(vars(self).values())
 
 
 def grid_pixels(size: tuple[int, int], stride: int) -> FloatArray:

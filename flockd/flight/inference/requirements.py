@@ -23,11 +23,9 @@ class Requirements:
 
     inputs: tuple[str, ...]
     """Meanings of its inputs."""
-    outputs: tuple[str, ...]
-    """Meanings of its outputs."""
+    outputs: Mapping[str, tuple[str, ...]]
+    """Meanings of its outputs, and the columns required of an output (n, k), in any order."""
     optional_inputs: tuple[str, ...] = ()
-    columns: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    """Required columns of an output (n, k), in any order."""
     thresholds: Mapping[str, Bounds] = field(default_factory=dict)
     crop: bool = False
     """Whether the manifest has to define how crops are cut."""
@@ -44,11 +42,11 @@ _OF_BOXES = ("centre_right_px", "centre_down_px", "width_px", "height_px", "dron
 _OF_RANGES = ("log_range_per_focal", "right_px", "down_px", "log_relative_sigma", "drone_logit", "log_apparent_size")
 
 REQUIREMENTS: Mapping[Role, Requirements] = {
-    "flow": Requirements(inputs=("first", "second"), outputs=("flow",)),
-    "depth": Requirements(inputs=("image",), outputs=("depth",), optional_inputs=_GEOMETRY),
+    "flow": Requirements(inputs=("first", "second"), outputs={"flow": ()}),
+    "depth": Requirements(inputs=("image",), outputs={"depth": ()}, optional_inputs=_GEOMETRY),
     "segmentation": Requirements(
         inputs=("image",),
-        outputs=("drone", "offset"),
+        outputs={"drone": (), "offset": ()},
         optional_inputs=_GEOMETRY,
         thresholds={
             "proposal_logit": _LOGIT,  # from it pixels make proposals: the second stage refuses what is no drone
@@ -57,8 +55,7 @@ REQUIREMENTS: Mapping[Role, Requirements] = {
     ),
     "detector": Requirements(
         inputs=("image",),
-        outputs=("boxes",),
-        columns={"boxes": _OF_BOXES},
+        outputs={"boxes": _OF_BOXES},
         thresholds={
             "box_probability": _POSITIVE,  # a box of less is not proposed
             "overlap": _PROBABILITY,  # of two boxes with a larger intersection over union the more probable one stays
@@ -71,8 +68,7 @@ REQUIREMENTS: Mapping[Role, Requirements] = {
     ),
     "distance": Requirements(
         inputs=("crop",),
-        outputs=("range",),
-        columns={"range": _OF_RANGES},
+        outputs={"range": _OF_RANGES},
         thresholds={
             **_OF_CROPS,
             "bearing_sigma_rad": _POSITIVE,  # standard deviation of a refined bearing, each way
@@ -83,8 +79,7 @@ REQUIREMENTS: Mapping[Role, Requirements] = {
     ),
     "verification": Requirements(
         inputs=("crop",),
-        outputs=("drone",),
-        columns={"drone": ("drone_logit",)},
+        outputs={"drone": ("drone_logit",)},
         # Up to the limit, the distance network's logit counts as well, for or against a drone.
         thresholds={**_OF_CROPS, "distance_logit_limit": _LIMIT},
     ),
@@ -105,16 +100,16 @@ def _faults_of_tensors(manifest: Manifest, role: Role, needed: Requirements) -> 
         if content not in manifest.contents:
             message = f"the role {role} needs one that carries {content!r}; name it so, or set its `carries`"
             yield Fault(("inputs",), message)
-    for result in needed.outputs:
-        if result not in manifest.results:
+    names = {spec.gives or name: name for name, spec in manifest.outputs.items()}
+    for result, columns in needed.outputs.items():
+        if result not in names:
             message = f"the role {role} needs one that gives {result!r}; name it so, or set its `gives`"
             yield Fault(("outputs",), message)
-    for result, columns in needed.columns.items():
-        spec = manifest.results.get(result)
+            continue
         for column in columns:
-            if spec is not None and column not in spec.columns:
+            if column not in manifest.results[result].columns:
                 message = f"has no {column!r}; name the model's columns in their order, of which {role} needs "
-                yield Fault(("outputs", _key(manifest, result), "columns"), message + ", ".join(columns))
+                yield Fault(("outputs", names[result], "columns"), message + ", ".join(columns))
 
 
 def _faults_of_numbers(manifest: Manifest, role: Role, needed: Requirements) -> Iterator[Fault]:
@@ -146,8 +141,3 @@ def _unknown_to_all(manifest: Manifest, known: list[Requirements]) -> Iterator[F
         if name not in names:
             message = f"is not a threshold of its roles; delete it, or write one of {', '.join(names)}"
             yield Fault(("thresholds", name), message if names else "is not a threshold of its roles; delete it")
-
-
-def _key(manifest: Manifest, result: str) -> str:
-    """The name of the output with a meaning."""
-    return next(name for name, spec in manifest.outputs.items() if (spec.gives or name) == result)

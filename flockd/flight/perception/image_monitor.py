@@ -235,17 +235,14 @@ class ImageMonitor:
 
     def _judge(self, camera: _Camera, verdict: _Fault | None, now: Shown, time_s: float) -> None:
         """Updates the camera's verdict, and its memory with an image that is used."""
-        if verdict in (_Fault.NOISE, _Fault.DAMAGE):
-            camera.fault, camera.since_s, camera.images = verdict, math.inf, 0
-        elif verdict is camera.fault:
-            camera.since_s, camera.images = math.inf, 0
-        else:
+        at_once, fault = (_Fault.NOISE, _Fault.DAMAGE), verdict
+        if not (settled := verdict is camera.fault or verdict in at_once):
             camera.since_s, camera.images = min(camera.since_s, time_s), camera.images + 1
-            if camera.fault in (_Fault.NOISE, _Fault.DAMAGE):
-                if camera.images >= self._parameters.clean_images:
-                    camera.fault, camera.since_s, camera.images = None, math.inf, 0
-            elif time_s - camera.since_s >= _LASTS_S and camera.images >= _LEAST_IMAGES:
-                camera.fault, camera.since_s, camera.images = verdict, math.inf, 0
+            settled = time_s - camera.since_s >= _LASTS_S and camera.images >= _LEAST_IMAGES
+            if camera.fault in at_once:
+                fault, settled = None, camera.images >= self._parameters.clean_images
+        if settled:
+            camera.fault, camera.since_s, camera.images = fault, math.inf, 0
         if camera.fault is _Fault.LENS:
             camera.noisiest = None  # after a bad lens the view may change at once
         elif camera.fault is None:

@@ -48,7 +48,7 @@ class CameraAgreement:
         turn, gain = before.R_ned_body.T @ after.R_ned_body, 1.0 - math.exp(-interval_s / _TIME_S)
         turned, moved = RigidTransform(turn, np.zeros(3)), RigidTransform(turn, velocity * interval_s)
         for name, camera in self._rig.cameras.items():
-            mine = pairs.select(pairs.camera_names == name)
+            mine = pairs[pairs.camera_names == name]
             ends = moved_pixels(camera, mine.previous, turned), moved_pixels(camera, mine.previous, moved)
             by_turn, by_both, seen = (
                 (end - mine.pixels_previous) @ [1.0, 1.0j] for end in (*ends, mine.pixels_current)

@@ -18,6 +18,7 @@ import numpy as np
 from flockd.core.config.tracking import TrackingParameters
 from flockd.core.messages import FloatArray
 from flockd.flight.geometry import log_polar_residual
+from flockd.flight.geometry.pairs import Columns
 from flockd.flight.tracking.measurement import Measurement
 
 SIZE = 8
@@ -30,7 +31,7 @@ MIN_RANGE_M = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class Measurements:
+class Measurements(Columns):
     """Measurements as arrays of shape (...), which broadcasts with the shape of the states."""
 
     bearing: FloatArray
@@ -58,10 +59,6 @@ class Measurements:
         log_range = np.array([m.log_range for m in measurements])
         log_size = np.log([m.size_m for m in measurements])
         return cls(*(a[:, None] for a in (bearing, log_range, log_size, np.sqrt(lasting), noise)))
-
-    def __getitem__(self, index: Sequence[int] | tuple[slice | int | None, ...]) -> Measurements:
-        """Some of the measurements, or all in another shape."""
-        return Measurements(*(column[index] for column in vars(self).values()))
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,6 +16,7 @@ import numpy as np
 
 from flockd.core.config.tracking import JITTER_S, TrackingParameters
 from flockd.core.messages import FloatArray, PossibleMotion
+from flockd.flight.geometry.pairs import Columns
 from flockd.flight.tracking import filter  # noqa: A004 - the field's word
 from flockd.flight.tracking.filter import Measurements
 from flockd.flight.tracking.measurement import Measurement
@@ -27,7 +28,7 @@ _HARDER = 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class Mixture:
+class Mixture(Columns):
     """States of n neighbours, each with m possible motions: flies as the own drone does, its own course, brakes."""
 
     probability: FloatArray
@@ -37,23 +38,11 @@ class Mixture:
     covariance: FloatArray
     """(n, m, 8, 8)"""
 
-    def __getitem__(self, index: Sequence[int]) -> Mixture:
-        """Some of the neighbours."""
-        return Mixture(self.probability[index], self.mean[index], self.covariance[index])
-
     def replaced(self, index: Sequence[int], by: Mixture) -> Mixture:
         """A copy in which the neighbours at `index` are those of another mixture."""
         probability, mean, covariance = self.probability.copy(), self.mean.copy(), self.covariance.copy()
         probability[index], mean[index], covariance[index] = by.probability, by.mean, by.covariance
         return Mixture(probability, mean, covariance)
-
-    def __add__(self, other: Mixture) -> Mixture:
-        """These neighbours followed by others."""
-        return Mixture(
-            np.concatenate([self.probability, other.probability]),
-            np.concatenate([self.mean, other.mean]),
-            np.concatenate([self.covariance, other.covariance]),
-        )
 
     @property
     def together(self) -> Mixture:

@@ -115,7 +115,8 @@ class Tracker:
             if row not in pairs:
                 pairs[row] = len(self._tracks)
                 self._tracks.append(self._begin(measurement))
-                self._motions += imm.first(measurement, own_velocity, self.parameters)
+                first = imm.first(measurement, own_velocity, self.parameters)
+                self._motions = imm.Mixture.concatenate([self._motions, first])
             numbers.append(self._tracks[pairs[row]].number)
         for track in self._tracks:
             self._confirm(track)

@@ -99,9 +99,7 @@ def _seen(points: Array, scale: float, noise_px: float, rng: np.random.Generator
         rays = share[:, None] * rays @ R_ned_camera.T
         offsets = np.tile(now.apply(camera.T_body_camera.translation), (len(end), 1))
         clear = (baseline > 0.08) & (inverse > 0.0)
-        parts.append(
-            GroundSamples(rays, inverse, offsets, 0.3 / 222.0 * share / np.maximum(baseline, 0.08)).select(clear)
-        )
+        parts.append(GroundSamples(rays, inverse, offsets, 0.3 / 222.0 * share / np.maximum(baseline, 0.08))[clear])
     return GroundSamples.concatenate(parts)
 
 
@@ -130,7 +128,7 @@ def test_a_wall_and_too_little_ground_are_no_plane() -> None:
     samples = _seen(_hillside(rng, np.zeros(2), 5.0, 0.0, 0.0), 1.0, 0.0, rng)
     with pytest.raises(ValueError, match="too little ground"):
         fit_ground(samples, 9.0, np.zeros(2), np.zeros(2))
-    few = samples.select(np.arange(len(samples.inverse)) < 40)
+    few = samples[np.arange(len(samples.inverse)) < 40]
     with pytest.raises(ValueError, match="too little ground"):
         fit_ground(few, 5.0, np.zeros(2), np.zeros(2))
 

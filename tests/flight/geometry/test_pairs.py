@@ -60,7 +60,7 @@ def test_both_ends_lie_on_the_wall_and_are_one_step_apart() -> None:
     pairs = lift(grid_pixels(SIZE, 5), wall_maps())
     # Between the border and the outermost pixel centres the depth is held, so there it is a little off.
     u, v = pairs.pixels_current.T
-    pairs = pairs.select((u > 0.5) & (u < SIZE[0] - 0.5) & (v > 0.5) & (v < SIZE[1] - 0.5))
+    pairs = pairs[(u > 0.5) & (u < SIZE[0] - 0.5) & (v > 0.5) & (v < SIZE[1] - 0.5)]
     assert len(pairs) > 200
     # Seen from the right camera the step is along the body's y axis. Sub-pixel ends meet the slanted wall too.
     # With 50 px a radian a plane's inverse range bends by 6e-5 between two pixels: 0.5 mm at 10 m.

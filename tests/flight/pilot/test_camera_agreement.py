@@ -58,7 +58,7 @@ def test_four_seconds_are_needed() -> None:
 def of_front(change: Callable[[PointPairs, np.random.Generator], PointPairs]) -> Seen:
     def seen(pairs: PointPairs, random: np.random.Generator) -> PointPairs:
         front = pairs.camera_names == "front"
-        return PointPairs.concatenate([pairs.select(~front), change(pairs.select(front), random)])
+        return PointPairs.concatenate([pairs[~front], change(pairs[front], random)])
 
     return seen
 
@@ -80,7 +80,7 @@ def before_a_wall(pairs: PointPairs, random: np.random.Generator) -> PointPairs:
         for range_m in (1.0, 4.0)
     )
     current = moved_pixels(camera, near, RigidTransform(np.eye(3), np.array([STEP_S, 0.0, 0.0])))
-    return replace(pairs, previous=far, pixels_current=current).select(camera.camera.in_image(current))
+    return replace(pairs, previous=far, pixels_current=current)[camera.camera.in_image(current)]
 
 
 @pytest.mark.parametrize(
@@ -89,7 +89,7 @@ def before_a_wall(pairs: PointPairs, random: np.random.Generator) -> PointPairs:
         (moved_at_random, CIRCLE),
         (beside_a_mate, CIRCLE),
         (before_a_wall, STRAIGHT),
-        (lambda pairs, _: pairs.select(np.arange(10)), CIRCLE),
+        (lambda pairs, _: pairs[np.arange(10)], CIRCLE),
     ],
     ids=["wrong flow", "a mate", "a wall", "sky"],
 )

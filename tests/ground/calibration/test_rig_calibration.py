@@ -144,7 +144,7 @@ def test_twice_the_matches_tell_twice_as_much_also_where_half_are_left_out() -> 
     mine = np.flatnonzero(pairs.camera_names == "right")
     motion, told = RigidTransform(np.eye(3), right.T_body_camera.rotation.T @ np.array([0.5, 0.0, 0.0])), []
     for count in (300, 600):
-        some = pairs.select(mine[np.linspace(0, len(mine) - 1, count).astype(np.int64)])
+        some = pairs[mine[np.linspace(0, len(mine) - 1, count).astype(np.int64)]]
         found = camera_motion(right, some, motion, 0.0)
         assert found is not None
         told.append(float(np.trace(found.information[:3, :3])))
@@ -166,7 +166,7 @@ def test_what_says_nothing_changes_nothing() -> None:
     for absurd in (fast, replace(second.vehicle, turn_rate=np.full(3, 1e200))):
         calibration.update(first, replace(second, vehicle=absurd), pairs)
     assert all(np.isfinite(one.turn).all() and np.isfinite(one.covariance).all() for one in calibration.deviations())
-    calibration.update(first, second, pairs.select(np.arange(20)))  # too few to tell
+    calibration.update(first, second, pairs[np.arange(20)])  # too few to tell
     assert all(np.linalg.norm(one.turn) == 0.0 for one in calibration.deviations())
 
 

@@ -64,4 +64,4 @@ def _samples(camera: RigCamera, observation: Observation, ego: EgoMotion) -> Gro
     clear = (baseline > MIN_BASELINE_M) & (inverse > 0.0)  # NaN compares false
     offsets = np.broadcast_to(R_ned_body @ mount.translation, rays.shape)
     sigma = FLOW_SIGMA_PX * camera.camera.pixel_angle(seen) / np.maximum(baseline, MIN_BASELINE_M)
-    return GroundSamples(rays, inverse, offsets, sigma).select(clear)
+    return GroundSamples(rays, inverse, offsets, sigma)[clear]
