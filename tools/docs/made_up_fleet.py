@@ -31,6 +31,7 @@ from flockd.core.messages import (
     VehicleState,
     Wanted,
 )
+from flockd.flight.safety import State
 from flockd.onboard.daemon.operator_orders import OperatorCommands, OperatorRequests
 from flockd.onboard.telemetry import publish_step
 from flockd.onboard.telemetry.publisher import DEFAULT_ENDPOINT, ZenohTelemetry
@@ -114,7 +115,7 @@ class MadeUpDrone:
         config = load_drone(data_path("config") / "simulator.yaml")
         about = AboutMessage(version=__version__, configuration=config.model_dump(mode="json"), commands=commands)
         self._commands = OperatorCommands(
-            commands, self._requests, self, loop, self._event, identity=telemetry.identity
+            commands, self._requests, self, loop, self._event, state=lambda: State.NORMAL, identity=telemetry.identity
         )
         telemetry.announce(self.name, about, self._commands.handle, self._image)
 
