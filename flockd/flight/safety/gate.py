@@ -50,7 +50,7 @@ class Gate:
         last, measured = self._last, request.around.velocity
         if last is not None and now_s - last.time_s > self._parameters.permission_timeout_s:
             last = None  # too old to continue from
-        if request.permission.action is Action.OFFER:  # the takeover starts at the drone's own velocity
+        if request.permission.action is Action.OFFER:  # the takeover starts at the drone's own velocity and height
             last = None
         if last is None:
             self.response.restart(measured)
@@ -107,12 +107,11 @@ class Gate:
         if (seen != velocity).any():
             objections.append(Objection.UNSEEN)
 
-        if action is not Action.OFFER:  # an offer on the ground, or flown by the pilot, keeps the control loop's height
-            most_m = p.max_climb_m_s * elapsed_s * share
-            climbed_m = _within(height_m, start.height_m - most_m, start.height_m + most_m)
-            height_m = _within(climbed_m, *between_neighbours(p, start.height_m, around.height_m, around.neighbours))
-            if height_m != climbed_m:
-                objections.append(Objection.SEPARATION)
+        most_m = p.max_climb_m_s * elapsed_s * share
+        climbed_m = _within(height_m, start.height_m - most_m, start.height_m + most_m)
+        height_m = _within(climbed_m, *between_neighbours(p, start.height_m, around.height_m, around.neighbours))
+        if height_m != climbed_m:
+            objections.append(Objection.SEPARATION)
         sent_m = _within(height_m, p.min_height_m, p.max_height_m)
         if sent_m != height_m:
             objections.append(Objection.HEIGHT)

@@ -309,7 +309,6 @@ def test_the_height_changes_at_the_limit_and_not_at_all_while_the_drone_stands_s
     assert stream.height(5.0, Action.ASK_HOLD) == pytest.approx(7.0)
     assert stream.height(5.0, Action.FLY_DEGRADED) == pytest.approx(6.95)
     assert stream.height(6.94) == pytest.approx(6.94)
-    assert stream.height(9.0, Action.OFFER) == 9.0
     stream.now_s += 0.31
     assert stream.height(5.0, height_m=7.0) == 7.0, "after silence from its own again"
 
@@ -575,6 +574,14 @@ def test_a_takeover_in_motion_begins_at_the_velocity_that_the_drone_has() -> Non
     assert north_m_s[:20] == [min(4.0, most_m_s)] * 20
     fall = 0.05 * GateParameters().max_acceleration_m_s2
     assert north_m_s[20:] == pytest.approx([north_m_s[19] - k * fall for k in range(1, 5)])
+
+
+def test_a_takeover_far_from_the_height_to_fly_at_begins_at_the_height_that_the_drone_has() -> None:
+    """With `autopilot.height_m` 20 at 3 m: PX4 climbs by 1 m/s for each metre that a setpoint is above the drone."""
+    stream, heights_m = Stream(max_climb_m_s=1.5), []
+    for tick in range(24):
+        heights_m.append(stream.height(20.0, Action.OFFER if tick < 20 else Action.FLY, height_m=3.0))
+    assert heights_m == pytest.approx([3.0] * 20 + [3.075, 3.15, 3.225, 3.3])
 
 
 @pytest.mark.parametrize("action", [Action.HOVER, Action.ASK_HOLD, Action.FLY])
