@@ -14,7 +14,7 @@ from flockd.flight.safety.half_planes import Limits
 COLUMN = 1.5
 """Horizontal distance, in degraded separations, within which a neighbour is above or below the drone: downwash widens
 on its way down, and drones do not hold their positions exactly."""
-_HEIGHT_NOISE_M = 0.3
+HEIGHT_NOISE_M = 0.3
 """Noise of a height over a few seconds: a smaller difference between commanded and own height does not count as a
 climb."""
 
@@ -132,6 +132,6 @@ def between_neighbours(p: GateParameters, start_m: float, own_m: float, offsets:
     up = -offsets[np.hypot(offsets[:, 0], offsets[:, 1]) < COLUMN * p.degraded_separation_m, 2]
     room_up = np.maximum(up[up > 0] - p.vertical_separation_m, 0.0).min(initial=math.inf)
     room_down = np.maximum(-up[up < 0] - p.vertical_separation_m, 0.0).min(initial=math.inf)
-    highest_m = max(own_m + float(room_up), min(start_m, own_m + _HEIGHT_NOISE_M))
-    lowest_m = min(own_m - float(room_down), max(start_m, own_m - _HEIGHT_NOISE_M))
+    highest_m = max(own_m + float(room_up), min(start_m, own_m + HEIGHT_NOISE_M))
+    lowest_m = min(own_m - float(room_down), max(start_m, own_m - HEIGHT_NOISE_M))
     return lowest_m, highest_m

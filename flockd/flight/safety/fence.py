@@ -9,7 +9,7 @@ import numpy as np
 from flockd.core.config.safety import GateParameters
 from flockd.core.messages import FloatArray
 from flockd.core.navigation import is_inside
-from flockd.flight.safety.approach import stopping_speed
+from flockd.flight.safety.approach import HEIGHT_NOISE_M, stopping_speed
 from flockd.flight.safety.half_planes import NO_LIMITS, Limits
 
 
@@ -21,8 +21,8 @@ def outside_fence(parameters: GateParameters, position: FloatArray) -> bool:
 
 
 def outside_heights(parameters: GateParameters, height_m: float) -> bool:
-    """Whether a height is outside the band, or not finite."""
-    return not parameters.min_height_m <= height_m <= parameters.max_height_m
+    """Whether a height is outside the band by more than the noise of one that is held at its edge, or not finite."""
+    return not parameters.min_height_m - HEIGHT_NOISE_M <= height_m <= parameters.max_height_m + HEIGHT_NOISE_M
 
 
 def towards_fence(p: GateParameters, position: FloatArray) -> Limits:

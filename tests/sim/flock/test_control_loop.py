@@ -49,6 +49,16 @@ def test_in_calm_air_nobody_is_held_or_slowed_by_wind() -> None:
     assert "wind" not in loop.slowed.by_cause
 
 
+@pytest.mark.parametrize("edge", ["min_height_m", "max_height_m"])
+def test_a_mission_may_fly_at_the_edge_of_the_heights(edge: str) -> None:
+    """The autopilot's height errs by a tenth of a metre, for longer than `safety.outside_s`."""
+    at_edge: dict[str, Any] = {f"drone__safety__gate__{edge}": 5.0, "drone__mission__height_m": 5.0}
+    scenario = _scenario(duration_s=30.0, **at_edge)
+    loop, places = _flown(scenario, vehicles_of(scenario))
+    assert loop.handed_over == {}
+    assert np.abs(places[-1, :, 2] + 5.0).max() < 1.0
+
+
 def test_gusts_beyond_the_limit_end_in_hold_with_the_reason_and_nothing_touches() -> None:
     """0.5 m/s an axis, 0.7 m/s off; `safety.max_velocity_error_m_s` is 0.8. A held drone is kept where it is."""
     scenario = _scenario(duration_s=60.0, vehicle__gust_m_s=0.8, seed=2)
