@@ -103,6 +103,8 @@ class DroneConfig(Section):
         faults: dict[tuple[str | int, ...], str] = {
             ("mission", *key): text for key, text in mission_faults(self.mission, self.safety.gate, law_m_s).items()
         }
+        if self.mission.at_end == "land" and (self.mission.height_offset_m or self.safety.first_flight_layer):
+            faults["mission", "at_end"] = "`land` leads down onto drones of other layers, out of view below; write hold"
         trim_m_s = 0.0 if self.autopilot is None else self.autopilot.max_velocity_trim_m_s
         if law_m_s > gate_m_s:
             faults["flocking", "max_speed_m_s"] = (

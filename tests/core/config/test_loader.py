@@ -104,6 +104,7 @@ def test_scalars_follow_the_core_schema(text: str, value: object) -> None:
 
 CAMERA, SLOW = "{name: front, device: /dev/video0}", "shared_memory: {speed_factor: 0.5}"
 CABLE = "autopilot: {address: 'serial:///dev/ttyS1:921600'}"
+LANDS = "kind: waypoints, at_end: land, waypoints: [{north_m: 30, east_m: 0}]"
 SLIPS = (
     ("step_s: -0.5", "step_s: -0.5 is not greater than 0; write a number of seconds above 0 and up to 60"),
     ("step_s: '0.5'", "step_s: '0.5' is not a number of seconds above 0 and up to 60; write 0.5"),
@@ -136,6 +137,8 @@ SLIPS = (
         "mission: {radius_m: 1e3, circle_until_s: 500}",
         "mission.radius_m: leads 495 m away on the circle, and the fence",
     ),
+    (f"mission: {{{LANDS}, height_offset_m: -4}}", "mission.at_end: `land` leads down onto drones of other layers"),
+    (f"mission: {{{LANDS}}}\nsafety: {{first_flight_layer: 1}}", "mission.at_end: `land` leads down onto drones of"),
     ("flocking: {desired_distance_m: 20}", "flocking.desired_distance_m: 20 is not below observation_distance_m 20"),
     ("telemetry: {listen: ['tcp/[::1]:1'], connect: ['tcp/[::1]:1']}", "telemetry: tcp/[::1]:1 is named twice in"),
     ("name: ..", "name: .. is not a name; write"),
