@@ -343,10 +343,12 @@ class AutopilotLink:
         """Sends a setpoint, once. Raises AutopilotError if it is not finite or MAVSDK cannot send it.
 
         The height is sent as a vertical velocity: PX4's frame may jump, and a height in the old frame would then make
-        PX4 climb or sink by the jump.
+        PX4 climb or sink by the jump. While the drone's own height is too old to fly by, it neither climbs nor sinks.
         """
         north, east = (float(v) for v in setpoint.velocity)
-        down = HEIGHT_GAIN_PER_S * (self.received.height_m - setpoint.height_m)
+        position = self.received.newest("LOCAL_POSITION_NED")
+        is_new = position is not None and self._clock() - position.time_s <= services.MOTION.timeout
+        down = HEIGHT_GAIN_PER_S * is_new * (self.received.height_m - setpoint.height_m)
         if not all(math.isfinite(number) for number in (north, east, down, setpoint.yaw_rad)):
             raise AutopilotError("a setpoint that is not finite was not sent")
         fields = {
