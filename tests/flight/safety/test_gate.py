@@ -578,9 +578,8 @@ def test_a_takeover_in_motion_begins_at_the_velocity_that_the_drone_has() -> Non
 
 def test_a_takeover_far_from_the_height_to_fly_at_begins_at_the_height_that_the_drone_has() -> None:
     """With `autopilot.height_m` 20 at 3 m: PX4 climbs by 1 m/s for each metre that a setpoint is above the drone."""
-    stream, heights_m = Stream(max_climb_m_s=1.5), []
-    for tick in range(24):
-        heights_m.append(stream.height(20.0, Action.OFFER if tick < 20 else Action.FLY, height_m=3.0))
+    stream, actions = Stream(max_climb_m_s=1.5), [Action.OFFER] * 20 + [Action.FLY] * 4
+    heights_m = [stream.height(20.0, action, height_m=3.0) for action in actions]
     assert heights_m == pytest.approx([3.0] * 20 + [3.075, 3.15, 3.225, 3.3])
 
 

@@ -194,9 +194,7 @@ async def test_the_vehicle_follows_the_velocity_and_holds_its_own_height(
         assert fake_autopilot.refused_setpoints == 0
 
 
-async def test_without_a_new_position_the_vehicle_sinks_no_farther(
-    address: str, fake_autopilot: FakeAutopilot
-) -> None:
+async def test_without_a_new_position_the_vehicle_sinks_no_farther(address: str, fake_autopilot: FakeAutopilot) -> None:
     """By its last position it would be above the height asked for, and sink, for ever."""
     async with flying(address, Wanted(np.zeros(2), np.zeros(2), yaw_rad=0.0, height_m=0.5)) as flight:
         await flight.enter_offboard()
