@@ -16,6 +16,7 @@ from matplotlib.figure import Figure as Drawing
 from flockd.campaign.figures import MEASURES, Figure, Interval, mean_interval
 from flockd.campaign.flight_plan import CASE
 from flockd.campaign.results import Results, Row
+from flockd.core.data import written_whole
 from flockd.review.report.style import BAND, DRONE_COLOURS, MUTED, STYLE, inline_svg, page_template
 
 MOST_ROWS = 200
@@ -54,7 +55,8 @@ def write_campaign_page(results: Results, path: Path) -> None:
         sections=_parts(results),
         text_columns=(REASON, AGAIN),
     )
-    path.write_text(page, encoding="utf-8")
+    with written_whole(path) as draft:
+        draft.write_text(page, encoding="utf-8")
 
 
 def _lead(results: Results) -> str:

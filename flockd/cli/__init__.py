@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import atexit
+import errno
 import importlib.util
 import os
 import sys
@@ -109,11 +110,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return _failed("interrupted", ExitCode.INTERRUPTED)
     except Exception as error:
+        if isinstance(error.__cause__, KeyboardInterrupt):  # while a library in C++ was being imported
+            return _failed("interrupted", ExitCode.INTERRUPTED)
         lacking = shortage_of(error)
         if lacking is not None:
             return _failed(f"out of {lacking}; raise the limits, or close other programs", ExitCode.UNAVAILABLE)
         if isinstance(error, OSError):
             remedy = "; check the path, its permissions and the disk" if error.filename else ""
+            remedy = "; make room on the disk" if error.errno in {errno.ENOSPC, errno.EDQUOT} else remedy
             return _failed(f"{error.filename or 'the system'}: {error.strerror or error}{remedy}", ExitCode.UNAVAILABLE)
         raise
     return code

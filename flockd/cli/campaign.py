@@ -9,7 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flockd.cli.options import refuse, require
+from flockd.cli.options import refuse, refuse_overwriting, require
 from flockd.cli.output import Phases, complain, say_result
 from flockd.cli.parser import Commands, commands_of, flag, option, positive_count
 from flockd.core.errors import ExitCode, UsageError
@@ -141,6 +141,7 @@ def _rerun(args: argparse.Namespace) -> int:
 
 def _report(args: argparse.Namespace) -> int:
     require(*(path for path in (args.folder, args.other) if path is not None))
+    refuse_overwriting(args, args.out)
     from flockd.campaign.campaign_page import write_campaign_page
     from flockd.campaign.folder import REPORT_NAME
     from flockd.campaign.results import Results, compare

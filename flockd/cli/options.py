@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flockd.cli.output import complain, progress
-from flockd.cli.parser import Parser, flag, number, option, positive_number
+from flockd.cli.parser import OnceEach, Parser, flag, number, option, positive_number
 from flockd.core.errors import ConfigError, ConfigProblem, FlockdError, UsageError
 from flockd.core.printable import printable
 
@@ -78,7 +78,7 @@ def add_settings(parser: Parser, what: str) -> None:
         "--set KEY=VALUE",
         f"{what}, as in `--set seed=3` or `--set 'mission={{kind: hover}}'`; may be given again",
         _setting,
-        action="append",
+        action=OnceEach,
         default=[],
         dest="settings",
     )

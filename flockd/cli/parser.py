@@ -136,6 +136,19 @@ class _Once(argparse.Action):
         setattr(namespace, self.dest, values)
 
 
+class OnceEach(argparse.Action):
+    """Appends a name and its value, and refuses a second value for it, of which only the last would count."""
+
+    def __call__(
+        self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, _: str | None = None
+    ) -> None:
+        """Raises ArgumentError."""
+        before = getattr(namespace, self.dest)
+        if values[0] in dict(before):
+            raise argparse.ArgumentError(self, f"{values[0]} is given twice; leave one out")
+        setattr(namespace, self.dest, [*before, values])
+
+
 def option(
     parser: argparse._ActionsContainer, spelling: str, what: str, kind: Callable[[str], Any] = str, **more: Any
 ) -> None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from flockd.cli.options import add_stretch, loaded, opened, refuse, refuse_overwriting, stretch
 from flockd.cli.output import complain, progress, say, say_facts, say_json
-from flockd.cli.parser import Commands, Parser, flag, option, positive_count
+from flockd.cli.parser import Commands, OnceEach, Parser, flag, option, positive_count
 from flockd.core.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ def add(commands: Commands) -> None:
         "--tolerance FIELD=X",
         "numbers of this field, such as command.velocity, may differ by X; may be given again",
         _tolerance,
-        action="append",
+        action=OnceEach,
         default=[],
     )
     flag(parser, "--json", "print the result as JSON")
@@ -166,6 +166,11 @@ def _check_options(args: argparse.Namespace) -> None:
     if args.out is not None and args.out.suffix != ".mcap":
         raise UsageError(f"{args.out}: a recording is written as .mcap; give it such a name")
     refuse_overwriting(args, args.out)
+    if args.update_reference:
+        from flockd.review.replay.difference import is_reference
+
+        if not is_reference(args.reference):
+            refuse_overwriting(args, args.reference)
 
 
 def _refuse_short(recording: Recording, start_s: float, end_s: float) -> None:

@@ -50,6 +50,15 @@ def test_the_same_results_in_any_order_and_after_any_interruption(plan: Plan, tm
     assert a == b
 
 
+def test_a_report_takes_no_other_files_place(plan: Plan, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    flown(plan, tmp_path / "out", Shuffled(1))
+    notes = tmp_path / "notes.html"
+    notes.write_text("mine", encoding="utf-8")
+    assert main(["campaign", "report", str(tmp_path / "out"), "--out", str(notes)]) == 2
+    assert capsys.readouterr().err == f"{notes}: exists; name another file\n"
+    assert notes.read_text(encoding="utf-8") == "mine"
+
+
 def test_a_kill_leaves_what_was_finished(plan: Plan, tmp_path: Path) -> None:
     """Three flights of which the last is cut off as it is written, and before the tables are."""
     path = tmp_path / "out"

@@ -86,6 +86,12 @@ def test_version(told: Told) -> None:
         (["replay", "x.mcap", "--tolerance", "command"], "flockd replay", "--tolerance: 'command'"),
         (["replay", "x.mcap", "--tolerance", "command=-1"], "flockd replay", "--tolerance: 'command=-1'"),
         (["sim", "--set", "seed"], "flockd sim", "--set: 'seed'"),
+        (["sim", "--set", "seed=1", "--set", "seed=2"], "flockd sim", "--set: seed is given twice; leave one out"),
+        (
+            ["replay", "x.mcap", "--diff", "--tolerance", "velocity=1", "--tolerance", "velocity=2"],
+            "flockd replay",
+            "--tolerance: velocity is given twice; leave one out",
+        ),
         (["sim", "--duration", "-3"], "flockd sim", "--duration: '-3'"),
         (["sim", "--duration", "nan"], "flockd sim", "--duration: 'nan'"),
         (["sim", "--drones", "0"], "flockd sim", "--drones: '0'"),
@@ -268,9 +274,10 @@ def test_a_shell_completes_commands_and_options(line: str, words: set[str]) -> N
             69,
             "out: Permission denied; check the path, its permissions and the disk",
         ),
+        (OSError(28, "No space left on device"), 69, "the system: No space left on device; make room on the disk"),
         (ModelError("models/flow.yaml: sha256: differs"), 78, "models/flow.yaml: sha256: differs"),
     ],
-    ids=["a missing extra", "a folder", "a damaged model"],
+    ids=["a missing extra", "a folder", "a full disk", "a damaged model"],
 )
 def test_what_a_flight_lacks_is_one_sentence(
     error: Exception, code: int, sentence: str, monkeypatch: pytest.MonkeyPatch, told: Told
@@ -280,6 +287,18 @@ def test_what_a_flight_lacks_is_one_sentence(
 
     monkeypatch.setattr("flockd.cli.sim._scenario", fails)
     assert told(code, "sim") == f"{sentence}\n"
+
+
+def test_ctrl_c_while_a_library_is_imported_ends_a_command_without_a_traceback(
+    monkeypatch: pytest.MonkeyPatch, told: Told
+) -> None:
+    """pybind11 reports it as an ImportError, as of ONNX Runtime."""
+
+    def interrupted(_: object) -> int:
+        raise ImportError("initialization failed") from KeyboardInterrupt()
+
+    monkeypatch.setattr("flockd.cli.sim._scenario", interrupted)
+    assert told(130, "sim") == "interrupted\n"
 
 
 def test_an_extra_is_added_to_a_checkout_without_freezing_it() -> None:

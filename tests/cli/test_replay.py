@@ -148,6 +148,13 @@ def test_other_settings_can_be_tried(path: Path, told: Told) -> None:
     assert error.startswith(f"{file}: rig.cameras: camera 'left' has 164 x 124 pixels, but {path} ")
 
 
+def test_a_reference_takes_no_other_files_place(path: Path, told: Told) -> None:
+    recording = path.read_bytes()
+    refused = told(2, "replay", path, "--reference", path, "--update-reference")
+    assert refused == f"{path}: exists; name another file\n"
+    assert path.read_bytes() == recording
+
+
 def test_what_keeps_a_replay_from_being_the_flight_is_told(
     path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:

@@ -71,19 +71,26 @@ class Copies:
 
 @contextmanager
 def video_file(draft: Path, target: Path, rate_hz: float) -> Iterator[Callable[[UInt8Array], None]]:
-    """Writes images (h, w, 3), RGB, all of one size, to the draft of a video. Raises UsageError if that cannot be."""
-    video = cv2.VideoWriter()
+    """Writes images (h, w, 3), RGB, all of one size, to the draft of a video. Raises UsageError if that cannot be.
+
+    OpenCV does not report a full disk: the index at the end of the file is then missing.
+    """
+    video, written = cv2.VideoWriter(), 0
 
     def write(image: UInt8Array) -> None:
+        nonlocal written
         size = (image.shape[1], image.shape[0])
         if not video.isOpened() and not video.open(str(draft), _CODEC, rate_hz, size):
             raise UsageError(f"{target}: cannot be written; name another place for it")
         video.write(cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+        written += 1
 
     try:
         yield write
     finally:
         video.release()
+    if written and cv2.VideoCapture(str(draft)).get(cv2.CAP_PROP_FRAME_COUNT) != written:
+        raise UsageError(f"{target}: cannot be written whole, as on a full disk; make room, or name another place")
 
 
 def _write_image(file: Path, image: UInt8Array) -> None:

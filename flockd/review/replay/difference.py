@@ -100,6 +100,14 @@ def save_reference(path: Path, drone: str, outputs: Outputs) -> None:
         draft.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
+def is_reference(path: Path) -> bool:
+    """Whether a file, which may be cut off, begins as `save_reference` begins it."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(len(_BEGINNING)) == _BEGINNING
+
+
 def load_reference(path: Path) -> Outputs:
     """Reads what `save_reference` wrote. Raises RecordingError, and OSError."""
     try:
@@ -115,6 +123,7 @@ def load_reference(path: Path) -> Outputs:
     return outputs
 
 
+_BEGINNING = b'{"drone": '
 _WHAT_TO_DO = "restore it, or write it again with --update-reference"
 
 

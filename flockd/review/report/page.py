@@ -13,6 +13,7 @@ import numpy as np
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
+from flockd.core.data import written_whole
 from flockd.review.flight_log.log import FlightLog
 from flockd.review.report.curves import account_curves, error_curves, flight_curves
 from flockd.review.report.filmstrip import Plate
@@ -68,7 +69,8 @@ def write_report(
         script=Markup((Path(__file__).parent / "report.js").read_text(encoding="utf-8")),
     )
     path = directory / "report.html"
-    path.write_text(page, encoding="utf-8")
+    with written_whole(path) as draft:
+        draft.write_text(page, encoding="utf-8")
     return path
 
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+import resource
 import shutil
+import signal
 import struct
 from pathlib import Path
 from typing import Any
@@ -14,8 +16,11 @@ import numpy as np
 import pytest
 
 from flockd.cli import main
+from flockd.core.data import written_whole
+from flockd.core.errors import UsageError
+from flockd.core.messages import UInt8Array
 from flockd.ground.calibration.fragment import rig_text
-from flockd.ground.pictures.copies import Copies
+from flockd.ground.pictures.copies import Copies, video_file
 from flockd.ground.pictures.picture_files import find_pictures
 from flockd.ground.pictures.single_frame import PictureDetector, camera_with_fov
 from tests import make
@@ -192,6 +197,30 @@ def test_an_interrupted_copy_leaves_the_one_before(tmp_path: Path, name: str) ->
         write(np.zeros((SIZE[1], SIZE[0], 3), np.uint8))
     assert [path.name for path in out.iterdir()] == [name]
     assert (out / name).stat().st_size > 100
+
+
+def test_a_video_that_a_full_disk_cuts_off_is_not_kept(tmp_path: Path) -> None:
+    """A limit of the file's size stands for the disk. FFmpeg reports neither."""
+    target, noise = tmp_path / "a.mp4", np.random.default_rng(0)
+    images = noise.integers(0, 255, (10, 240, 320, 3), dtype=np.uint8)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
+        with pytest.raises(UsageError, match=r"a\.mp4: cannot be written whole, as on a full disk; make room"):
+            write_video(target, images)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        signal.signal(signal.SIGXFSZ, before)
+    assert list(tmp_path.iterdir()) == []
+    write_video(target, images)
+    assert target.stat().st_size > 100_000, "the limit was too large to test anything"
+
+
+def write_video(target: Path, images: UInt8Array) -> None:
+    with written_whole(target) as draft, video_file(draft, target, 10.0) as write:
+        for image in images:
+            write(image)
 
 
 def drone_file(path: Path, cameras: tuple[str, ...] = ("front",)) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import re
@@ -120,6 +121,22 @@ def _report(folder: Path, log: FlightLog, *moments: KeyFrame) -> str:
     save_flight(folder, log, moments)
     write_report_files(folder, log)
     return (folder / "report.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_full_disk_leaves_no_half_of_a_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Which `flockd report` would then leave as it was."""
+    whole = Path.write_text
+
+    def cut_off(path: Path, text: str, encoding: str) -> None:
+        whole(path, text[: len(text) // 2], encoding=encoding)
+        if path.suffix == ".html":
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", cut_off)
+    with pytest.raises(OSError, match="No space left"):
+        _report(tmp_path, _flight(duration_s=5.0))
+    assert not list(tmp_path.glob("*.html"))
 
 
 class Page(HTMLParser):
