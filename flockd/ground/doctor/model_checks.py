@@ -89,6 +89,9 @@ def meadow(size: tuple[int, int], number: int) -> UInt8Array:
     return image
 
 
+FASTER = "give perception.threads more cores, raise step_s, take smaller images, or `perception.flow: dis`"
+
+
 def judge_steps(config: DroneConfig, timed: list[tuple[float, PilotOutput]], busy: float, cores: int) -> Finding:
     """Whether the steps leave time to spare; ``busy``: the load of the computer's ``cores``."""
     took_s = statistics.median(seconds for seconds, _ in timed[1:])
@@ -100,7 +103,7 @@ def judge_steps(config: DroneConfig, timed: list[tuple[float, PilotOutput]], bus
         f"{'threads' if threads > 1 else 'thread'} and {count} {'cameras' if count > 1 else 'camera'} ({longest})"
     )
     load = took_s / config.step_s
-    fix = "give perception.threads more cores, raise step_s, take smaller images, or `perception.flow: dis`"
+    fix = FASTER
     if busy > cores:
         fix = f"stop other programs first (a load of {busy:.0f} on {cores} cores), and {fix}"
     too_much, much = load > config.safety.degraded_load, load > FULL * config.safety.degraded_load

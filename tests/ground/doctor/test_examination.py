@@ -18,7 +18,7 @@ from flockd.cli import main
 from flockd.core.config import DroneConfig
 from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.data import data_path
-from flockd.core.errors import ModelError
+from flockd.core.errors import ModelError, UnavailableError
 from flockd.ground.doctor import CHECKS, Check, Finding, Level, passed, run_checks
 from flockd.onboard.autopilot.link_owner import only_owner
 from flockd.onboard.recording.reader import Recording
@@ -174,6 +174,22 @@ def test_the_bench_of_a_demo_tells_what_is_made_up_and_how_long_its_steps_took(
     assert sum(any(one["confirmed"] for one in output["neighbours"]) for output in recorded) == 8
     took_ms = statistics.median(sum(output["stages_ms"].values()) for output in recorded[1:])
     assert f"a step takes {took_ms:.0f} of 500 ms" in findings["step"]["measured"]
+
+
+def test_a_computer_too_slow_to_fly_the_bench_fails_it_with_what_to_do(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    late = "drone1 had no flockd that was ready to fly it within 60 s (flockd: a step takes 284% of the step time)"
+
+    def fly(*_: object, **__: object) -> None:
+        raise UnavailableError(late)
+
+    monkeypatch.setattr("flockd.sim.sitl.fleet.fly_fleet", fly)
+    assert main(["doctor", "--bench", "--demo", "--json"]) == 1
+    _, daemon = json.loads(capsys.readouterr().out)["findings"]
+    assert (daemon["about"], daemon["level"], daemon["measured"]) == ("daemon", "FAILURE", late)
+    for remedy in ("stop other programs", "perception.threads", "step_s", "smaller images"):
+        assert remedy in daemon["mend"]
 
 
 @pytest.mark.parametrize(
