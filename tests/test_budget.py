@@ -20,16 +20,16 @@ from flockd.onboard.recording.reader import Recording
 
 ROOT = Path(__file__).parents[1]
 LINES = {
-    "flockd/core": 3_310,
+    "flockd/core": 3_350,
     "flockd/flight": 10_060,
     "flockd/onboard": 9_370,
     "flockd/fleet": 2_740,
-    "flockd/ground": 5_230,
+    "flockd/ground": 5_280,
     "flockd/review": 3_600,
-    "flockd/sim": 8_910,
+    "flockd/sim": 8_920,
     "flockd/campaign": 1_490,
-    "flockd/cli": 3_800,
-    "tests": 39_870,
+    "flockd/cli": 3_820,
+    "tests": 40_000,
     "tools/checks": 2_060,
     "tools/docs": 1_010,
     "tools/measure": 1_540,

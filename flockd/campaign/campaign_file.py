@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, model_validator
 
 from flockd.campaign.figures import MEASURES, Figure
-from flockd.core.config.base import Name, NonNegative, Section, refuse
+from flockd.core.config.base import Name, Section, refuse
 from flockd.core.config.document import KeyPath, Place, read_document
 from flockd.core.config.loader import require, validated
 
@@ -59,7 +59,7 @@ class CampaignConfig(Section):
     fixed: dict[str, Any] = Field(default_factory=dict)
     """Values of keys for all flights, by dotted key: `drone.flocking.cohesion: 0.2`, `duration_s: 40`. `drones` is the
     size of the flock."""
-    scatter_m: NonNegative = 0.0
+    scatter_m: Annotated[float, Field(ge=0, le=100)] = 0.0
     """Largest random shift of every start to the north and to the east, by the flight's seed."""
     vary: dict[str, Variation] = Field(default_factory=dict)
     """Keys that vary, with dots. All combinations of their values are flown; each is a cell."""
@@ -93,7 +93,12 @@ class CampaignConfig(Section):
         for section, keys in (("fixed", self.fixed), ("vary", self.vary)):
             if "seed" in keys:
                 faults[section, "seed"] = "is set for each flight; write `seed` and `seeds` at the top level instead"
+        for number, figure in enumerate(self.measure or ()):
+            if figure in (self.measure or ())[:number]:
+                faults["measure", number] = f"{figure} is named already; delete one"
         for case, values in self.cases.items():
+            if case != (first := next(name for name, same in self.cases.items() if same == values)):
+                faults["cases", case] = f"has the values of {first}; change them, or delete one"
             if "seed" in values:
                 faults["cases", case, "seed"] = "is set for each flight; write `seed` and `seeds` at the top level"
         refuse(self, faults)

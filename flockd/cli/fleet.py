@@ -106,11 +106,24 @@ def _add_orders(commands: Commands) -> None:
 
 
 def _ordering(parser: Parser) -> Parser:
-    option(parser, "DRONES", f"names with commas between them, or `{ALL}`")
+    option(parser, "DRONES", f"names with commas between them, or `{ALL}`", _names)
     add_endpoint_options(parser)
     add_operator_option(parser)
     flag(parser, "--json", "print the last replies as JSON, by drone")
     return parser
+
+
+def _names(text: str) -> list[str]:
+    """None for all."""
+    from flockd.onboard.telemetry.topics import is_name
+
+    names = [] if text == ALL else [name.strip() for name in text.split(",")]
+    for name in names:
+        if not is_name(name):
+            raise argparse.ArgumentTypeError(f"{name!r} is not a drone's name; write names with commas, or `{ALL}`")
+        if name == ALL:
+            raise argparse.ArgumentTypeError(f"{text!r} names `{ALL}` beside others; write one of both")
+    return names
 
 
 def _goto(args: argparse.Namespace) -> int:
@@ -159,7 +172,7 @@ def _ask(args: argparse.Namespace, command: str, order: MissionOrder | None = No
             if time.monotonic() + REPEAT_S > until_s or over.wait(REPEAT_S):
                 return
 
-    names = [] if args.drones == ALL else args.drones.split(",")
+    names: list[str] = args.drones
     asked: dict[str, Future[None]] = {}
     with (
         FleetWatcher(args.fleet, listen=listen, connect=connect, settings=args.zenoh_config) as watcher,

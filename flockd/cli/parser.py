@@ -8,6 +8,7 @@ import math
 import re
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, NoReturn, Protocol
 
 from flockd.cli.output import complain
@@ -37,6 +38,7 @@ class Parser(argparse.ArgumentParser):
             formatter_class=_Help,
             allow_abbrev=False,
         )
+        self.register("type", Path, _path)
         self.commands: list[str] = []
         """Names of its commands, if it has any."""
         self.default_command: str | None = None
@@ -164,6 +166,13 @@ def option(
     if name.startswith("-"):
         more.setdefault("action", _Once)
     parser.add_argument(name, help=what, type=kind, **more)
+
+
+def _path(text: str) -> Path:
+    """As of a shell's variable that is not set: the folder one is in would be taken for it."""
+    if not text:
+        raise argparse.ArgumentTypeError("'' is no path; name one")
+    return Path(text)
 
 
 def flag(parser: argparse._ActionsContainer, name: str, what: str) -> None:

@@ -10,6 +10,9 @@ from typing import Literal
 
 from flockd.core.errors import UnavailableError
 
+LFS_POINTER = b"version https://git-lfs.github.com/spec/"
+"""What stands in a file's place where Git LFS has not fetched it."""
+
 
 def data_path(folder: Literal["config", "models", "systemd"]) -> Path:
     """The folder of that name, inside an installed package or beside the package in a checkout.

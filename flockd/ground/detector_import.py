@@ -22,7 +22,7 @@ from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
-from flockd.core.data import data_path
+from flockd.core.data import LFS_POINTER, data_path
 from flockd.core.errors import ModelError, UsageError
 from flockd.flight.inference import load_manifest
 from flockd.flight.inference.feeds import golden_feeds
@@ -129,6 +129,8 @@ def _read(file: Path) -> onnx.ModelProto:
     except OSError as error:
         raise ModelError(f"{file}: cannot be read ({error.strerror}); name the ONNX file") from None
     except (DecodeError, onnx.checker.ValidationError, onnx.shape_inference.InferenceError):
+        if file.read_bytes().startswith(LFS_POINTER):
+            raise ModelError(f"{file}: is a pointer of Git LFS; fetch the file with `git lfs pull`") from None
         raise ModelError(f"{file}: is no ONNX file, or a damaged one; export it again as ONNX") from None
 
 

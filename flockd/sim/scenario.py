@@ -14,7 +14,7 @@ import numpy as np
 import yaml
 from pydantic import Field, model_validator
 
-from flockd.core.config.base import NonNegative, Positive, Section, Share, Speed, Vector3, refuse
+from flockd.core.config.base import FromHome, NonNegative, Positive, Section, Share, Speed, refuse
 from flockd.core.config.document import Document, KeyPath, Place, read_document
 from flockd.core.config.drone import DroneConfig
 from flockd.core.config.loader import Overrides, drone_document, kind_of, override, require, validated
@@ -35,21 +35,21 @@ MIN_START_DISTANCE_M = 0.7
 """Smallest distance of two drones at the start, about the size of one: nearer, they touch."""
 
 
+_Wind = Annotated[float, Field(ge=-50, le=50)]
+"""m/s; a hurricane's, and faster than any of these vehicles."""
+
+
 class StartConfig(Section):
     """The start of one vehicle."""
 
-    position_m: Vector3
+    position_m: tuple[FromHome, FromHome, float]
     """North, east, down: a height of 4.5 m is -4.5."""
-    velocity_m_s: tuple[float, float] = (0.0, 0.0)
+    velocity_m_s: tuple[_Wind, _Wind] = (0.0, 0.0)
     """North, east."""
     mission: MissionParameters | None = None
     """Its own mission; null: that of `drone`. Positions count from the world's origin."""
     by_hand: bool = False
     """Whether a person flies it along its mission, in Position mode and without flockd; it looks like the others."""
-
-
-_Wind = Annotated[float, Field(ge=-50, le=50)]
-"""m/s; a hurricane's."""
 
 
 class VehicleConfig(Section):
@@ -91,6 +91,12 @@ class RangeFinderConfig(Section):
     """Mean number of dropouts per minute."""
     dropout_s: Positive = 0.5
     """Mean duration of a dropout."""
+
+    @model_validator(mode="after")
+    def _measures_something(self) -> Self:
+        if self.min_m >= self.max_m:
+            refuse(self, {("min_m",): f"{self.min_m:g} is not below max_m {self.max_m:g}; write a smaller one"})
+        return self
 
 
 class SensorConfig(Section):
@@ -167,13 +173,13 @@ class ObstaclesConfig(Section):
 class WorldConfig(Section):
     """The world."""
 
-    ground_relief_m: NonNegative = 0.15
+    ground_relief_m: Annotated[float, Field(ge=0, le=2)] = 0.15
     """Standard deviation of the gently uneven ground; 0 is flat."""
     hills_m: Annotated[float, Field(ge=0, le=20)] = 0.0
     """Height from the lowest to the highest point of hills, if `hills_slope` permits it; level at the origin."""
     hills_slope: Annotated[float, Field(gt=0, le=0.5)] = 0.15
     """Steepest slope of the hills."""
-    clearance_m: NonNegative = 9.0
+    clearance_m: Annotated[float, Field(ge=0, le=100)] = 9.0
     """Width without obstacles on both sides of the planned path."""
     drone_family: Annotated[int, Field(ge=0, le=FAMILIES - 1)] | Literal["any"] = "any"
     """Shape of the drones; `any`: drawn from the seed, the same for the whole flock."""
@@ -225,6 +231,12 @@ class DetectionsConfig(Section):
     """Mean duration of a false neighbour, from its confirmation on."""
     false_m: tuple[Positive, Positive, Positive] = _TRAINED["false_m"]
     """Distances of false neighbours: 10th, 50th and 90th percentile."""
+
+    @model_validator(mode="after")
+    def _percentiles_rise(self) -> Self:
+        if sorted(self.false_m) != list(self.false_m):
+            refuse(self, {("false_m",): "falls; write the 10th, the 50th and the 90th percentile in this order"})
+        return self
 
     @property
     def filled(self) -> Self:
@@ -364,10 +376,15 @@ class ScenarioConfig(Section):
         return [(self.drone_of(i).mission, vehicle.by_hand) for i, vehicle in enumerate(self.vehicles)]
 
     def warnings(self) -> list[str]:
-        """What can be flown and is hardly meant: vehicles that begin out of sight of all others."""
+        """What can be flown and is hardly meant: vehicles out of sight of all others, and what comes after the end."""
         sight_m, places = self.drone.perception.detection.max_range_m, [one.position_m for one in self.vehicles]
         nearest_m = [min((dist(one, other) for other in places if other != one), default=0.0) for one in places]
-        return [
+        begin_s = {f"faults[{number}].begin_s": one.begin_s for number, one in enumerate(self.faults)}
+        begin_s |= {f"takeovers[{number}].time_s": one.time_s for number, one in enumerate(self.takeovers)}
+        late = (
+            f"is not before the flight's end, duration_s {self.duration_s:g}: it will not happen; write an earlier one"
+        )
+        return [f"{key}: {at_s:g} {late}" for key, at_s in begin_s.items() if at_s >= self.duration_s] + [
             f"vehicles[{number}].position_m: begins {apart_m:.0f} m from the nearest other, and drones see others up "
             f"to perception.detection.max_range_m, {sight_m:g} m; move it nearer, unless its mission does"
             for number, apart_m in enumerate(nearest_m)
@@ -419,6 +436,8 @@ class ScenarioConfig(Section):
                 if entry.drone > count:
                     text = f"is {entry.drone}, but there are {count} vehicles; write one of theirs"
                     yield (section, number, "drone"), text
+                elif self.vehicles[entry.drone - 1].by_hand:
+                    yield (section, number, "drone"), f"is {entry.drone}, which is flown by hand; write one of flockd's"
         for number, fault in enumerate(self.faults):
             if fault.camera not in cameras:
                 yield ("faults", number, "camera"), f"is not in the rig; write one of {', '.join(cameras)}"

@@ -106,6 +106,8 @@ def test_a_plan_is_its_own_copy(tmp_path: Path) -> None:
             "9: vary.drone.flocking.cohesion.values[1]: -1 is not at least 0",
         ),
         ("fixed:\n  vehicles.0: 4\n", "6: fixed.vehicles.0: `vehicles` is not a section"),
+        ("measure: [collisions, collisions]\n", "5: measure[1]: collisions is named already; delete one"),
+        ("cases: {a: {drones: 4}, b: {drones: 4}}\n", "5: cases.b: has the values of a; change them, or delete one"),
         ("fixed: {drones: 5.5}\n", "5: fixed.drones: must be whole numbers from 1 to 100"),
         (
             "vary:\n  duration_s: {values: [5.0, 6.0, 5.0]}\n",

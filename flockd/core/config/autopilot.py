@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field
 
 from flockd.core import services
-from flockd.core.config.base import Distance, Port, Section, Share, Speed, text
+from flockd.core.config.base import Distance, Port, Section, Speed, text
 
 
 def _baud(address: str) -> str:
@@ -18,7 +18,8 @@ def _baud(address: str) -> str:
     rates = [name[1:] for name in dir(termios) if re.fullmatch(r"B[1-9]\d*", name)]
     if address.startswith("serial:") and baud not in rates:
         known = ", ".join(sorted(rates, key=int)[-12:])
-        raise ValueError(f"{address} has the baud rate {baud}, which no port has; write the autopilot's, of {known}")
+        told = "has no baud rate" if "/" in baud else f"has the baud rate {baud}, which no port has"
+        raise ValueError(f"{address} {told}; write the autopilot's, of {known}")
     return address
 
 
@@ -35,7 +36,7 @@ class AutopilotParameters(Section):
         ),
     ] = "udpin://127.0.0.1:14540"
     """`udpin://` waits for an autopilot that sends to this address; `serial:///dev/ttyS1:921600` is a cable."""
-    system_id: Annotated[int, Field(ge=1, le=255)] | None = None
+    system_id: Annotated[int, Field(ge=1, le=250)] | None = None
     """The autopilot's MAV_SYS_ID, different for each drone of the fleet; flockd ignores other systems. By default that
     of the only autopilot on the link; flockd refuses to start if there are two."""
     setpoint_rate_hz: Annotated[float, Field(ge=5, le=50)] = services.SETPOINT.rate_hz
@@ -54,5 +55,5 @@ class AutopilotParameters(Section):
     """Limit of the correction of setpoints by the difference between the cameras' velocity and the autopilot's: the
     autopilot flies by its own estimate, which errs by 0.1 to 0.3 m/s with GNSS alone. 0: no correction. No effect with
     `own_velocity: autopilot`."""
-    low_battery_share: Share = 0.2
+    low_battery_share: Annotated[float, Field(ge=0, lt=1)] = 0.2
     """Share of the charge at or below which the battery counts as low."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 import re
 from collections.abc import Mapping
 from typing import Annotated, Any
@@ -42,12 +43,27 @@ PlainName = Annotated[str, text(r"^[a-z0-9_-]+$", "a name, of small letters, dig
 
 
 def checked_port(address: str) -> str:
-    """Raises ValueError for a number that is no network port, and for 0, which means any port."""
+    """Raises ValueError for a number that is no network port, for 0, which means any port, and for an impossible host."""
     kind, _, rest = address.partition("/")
-    port = re.search(r":(\d+)(?:[?#].*)?$", rest)
-    if port and kind.rstrip(":") in _WITH_PORTS and not 0 < int(port[1]) <= 65535:
-        raise ValueError(f"{address} has the port {port[1]}; write one from 1 to 65535")
+    found = re.search(r"^/?(.+):(\d+)(?:[?#].*)?$", rest)
+    if found and kind.rstrip(":") in _WITH_PORTS:
+        host, port = found.groups()
+        if not 0 < int(port) <= 65535:
+            raise ValueError(f"{address} has the port {port}; write one from 1 to 65535")
+        if not _is_host(host, brackets=not kind.endswith(":")):
+            raise ValueError(f"{address} has the host {host}; write an IP address or a computer's name")
     return address
+
+
+def _is_host(text: str, *, brackets: bool) -> bool:
+    """Whether it is an IP address, of version 6 in ``brackets``, or may be a name."""
+    number = text[1:-1].partition("%")[0] if brackets and re.fullmatch(r"\[.*\]", text) else text
+    if number is text and re.fullmatch(r"[\d.]+", text) is None:
+        return re.fullmatch(r"[\w-]+(\.[\w-]+)*\.?", text) is not None
+    try:
+        return ipaddress.ip_address(number).version == (4 if number is text else 6)
+    except ValueError:
+        return False
 
 
 _WITH_PORTS = {"tcp", "udp", "tls", "quic", "ws", "udpin", "udpout", "tcpin", "tcpout"}

@@ -43,14 +43,17 @@ _OnBoard = Annotated[float, Field(ge=-5, le=5)]
 """Metres; the largest offset of a camera on such vehicles."""
 
 
+_Turn = Annotated[float, Field(ge=-360, le=360)]
+
+
 class ExtrinsicsConfig(Section):
     """Mounting of a camera: position in body FRD, and angles from looking forward: yaw right, pitch up, roll
     clockwise."""
 
     position_m: tuple[_OnBoard, _OnBoard, _OnBoard] = (0.0, 0.0, 0.0)
-    yaw_deg: float = 0.0
-    pitch_deg: float = 0.0
-    roll_deg: float = 0.0
+    yaw_deg: _Turn = 0.0
+    pitch_deg: _Turn = 0.0
+    roll_deg: _Turn = 0.0
     measured: MeasurementConfig | None = None
 
 
@@ -75,6 +78,8 @@ _OFF_CENTRE = 0.16
 lens was calibrated for another size or for an image on its side; of real lenses it is some percent."""
 _SQUARE = 0.15
 """Largest difference of fx and fy: pixels are square unless images were squeezed from another aspect ratio."""
+_ROUNDED_RAD = 0.005
+"""Rounding of a written angle: 1.57 is a quarter turn."""
 NARROWEST_DEG = 5.0
 WIDEST_DEG = {"pinhole": 130.0, "wide_angle": 220.0}
 
@@ -123,6 +128,16 @@ class RigConfig(Section):
     cameras: Annotated[tuple[CameraConfig, ...], Field(min_length=1)]
     time_offset_s: Annotated[float, Field(ge=-1, le=1)] = 0.0
     """Added to a frame's time stamp, it gives the time of the autopilot's attitude at which the frame was taken."""
+
+    @model_validator(mode="after")
+    def _turns_are_degrees(self) -> Self:
+        """All turns about the vertical, two or more, that are multiples of pi/4 are radians."""
+        turned = {n: camera.extrinsics.yaw_deg for n, camera in enumerate(self.cameras) if camera.extrinsics.yaw_deg}
+        off = [math.remainder(abs(yaw), math.pi / 4) for yaw in turned.values() if abs(yaw) < 2.0 * math.pi]
+        if len(off) == len(turned) > 1 and max(map(abs, off)) < _ROUNDED_RAD:
+            told = "is in radians, as all the others are; write degrees"
+            refuse(self, {("cameras", n, "extrinsics", "yaw_deg"): f"{yaw:g} {told}" for n, yaw in turned.items()})
+        return self
 
     @model_validator(mode="after")
     def _names_are_unique(self) -> Self:

@@ -202,14 +202,20 @@ _LACKS = {
 }
 
 
-def _misplaced(camera: CameraDeviceParameters, kind: str) -> dict[tuple[str, ...], str]:
+def _misplaced(camera: CameraDeviceParameters, kind: str) -> dict[tuple[str | int, ...], str]:
     """Faults of a camera's keys for this kind of source: keys that it must not have, by key, or a missing one."""
-    faults: dict[tuple[str, ...], str] = {
+    faults: dict[tuple[str | int, ...], str] = {
         (key,): f"is of a source of kind `{other}`; delete it, or write `kind: {other}`"
         for other, keys in _KEYS.items()
         for key in keys
         if other != kind and getattr(camera, key) != type(camera).model_fields[key].default
         if not (camera.crop and key == "turn_deg")
+    }
+    controls = [control.name for control in camera.controls]
+    faults |= {
+        ("controls", number, "name"): f"{name} is set twice; delete one"
+        for number, name in enumerate(controls)
+        if name in controls[:number]
     }
     if camera.crop_of is not None and camera.crop is None:
         faults["crop_of",] = "is of a `crop`, and there is none; add it, or delete this"

@@ -42,6 +42,8 @@ class BoardSpec:
     def __post_init__(self) -> None:
         if min(self.columns, self.rows) < 3 or max(self.columns, self.rows) > 50:
             raise CalibrationError(f"a board of {self.columns}x{self.rows} squares does not exist; take 3 to 50 a side")
+        if not 0.001 <= self.square_m <= 1.0:
+            raise CalibrationError(f"squares of {1e3 * self.square_m:g} mm are not printed; take 1 to 1000 mm")
         if self.corner_count < MIN_CORNERS:
             raise CalibrationError(
                 f"a board of {self.columns}x{self.rows} squares has too few corners; take 5x4 or more"

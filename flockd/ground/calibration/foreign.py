@@ -65,6 +65,13 @@ def foreign_lenses(file: Path, size: tuple[int, int] | None) -> list[ForeignLens
         raise CalibrationError(
             f"{told}; give Kalibr's camchain, ROS's camera_info, OpenCV's FileStorage or COLMAP's cameras.txt"
         ) from error
+    for lens in found:
+        if size not in {None, lens.size}:
+            told = f"is of {lens.size[0]} x {lens.size[1]} images, and --size is another; leave it out"
+            raise CalibrationError(f"{file}: {lens.name}: {told}")
+    names = [lens.name for lens in found]
+    if twice := [name for number, name in enumerate(names) if name in names[:number]]:
+        raise CalibrationError(f"{file}: has two cameras of the name {twice[0]}; give each its own")
     if not found:
         raise CalibrationError(f"{file}: holds no camera; give Kalibr's camchain, or another calibration")
     return found
@@ -75,8 +82,12 @@ def _read(file: Path, size: tuple[int, int] | None) -> list[ForeignLens]:
     if re.search(r"^\s*\d+\s+[A-Z_]+\s+\d+\s+\d+\s", text, re.MULTILINE):
         return [_of_colmap(line.split()) for line in text.splitlines() if re.match(r"\s*\d", line)]
     if text.startswith("%YAML:1") or "opencv-matrix" in text or "opencv_storage" in text:
-        return [_of_matrices(_opencv(file), file.stem, size)]
-    values = yaml.safe_load(text)
+        return [_of_matrices(values, name, size) for name, values in _opencv(file)]
+    values, *others = [one for one in yaml.safe_load_all(text) if one is not None] or [None]
+    if others:
+        raise CalibrationError(f"{file}: holds {1 + len(others)} documents; write each to a file of its own")
+    if isinstance(values, dict) and {"width", "height"} <= values.keys():
+        values = {_ECHOED.get(key.lower(), key): one for key, one in values.items()}
     if not isinstance(values, dict):
         raise ValueError("keys with values")  # noqa: TRY004 - told as what else is wrong with a file
     if "rig" in values:
@@ -92,6 +103,8 @@ def _lens(
     """``numbers``: fx, fy, cx, cy, and xi, alpha, beta where the model has them; ``shift``: of pixel centres."""
     coefficients = tuple(float(k) for k in np.ravel(distortion))
     found = np.array([*map(float, numbers), *coefficients, skew])
+    if [*map(float, size)] != [*map(int, size)]:
+        raise ValueError(f"width and height of {name}, as whole numbers")
     if len(numbers) not in (4, 7) or not np.isfinite(found).all() or not found[:2].min() > 0:
         raise ValueError(f"fx, fy, cx, cy and coefficients of {name}, as finite numbers")
     fx, fy, cx, cy, *mirror = map(float, numbers)
@@ -134,11 +147,11 @@ def _of_kalibr(name: str, values: Mapping[str, Any]) -> ForeignLens:
 
 def _of_matrices(values: Mapping[str, Any], name: str, size: tuple[int, int] | None) -> ForeignLens:
     """Of ROS and OpenCV."""
-    matrix = np.array(values["camera_matrix"]["data"], np.float64)
+    matrix = np.array(_data(values["camera_matrix"]), np.float64)
     if matrix.size != 9 or not matrix.any():
         raise ValueError(f"the camera_matrix, {matrix.size} numbers{'' if matrix.any() else ' that are 0'}")
     matrix = matrix.reshape(3, 3)
-    distortion = values.get("distortion_coefficients", {"data": ()})["data"]
+    distortion = _data(values.get("distortion_coefficients", ()))
     if "image_width" in values:
         size = values["image_width"], values["image_height"]
     if size is None:
@@ -161,10 +174,25 @@ _NAMES: Mapping[str, tuple[str, ...]] = {
 """What OpenCV's programs and tutorials call them."""
 
 
-def _opencv(file: Path) -> dict[str, Any]:
-    """What `cv2.FileStorage` wrote, under ROS's names."""
+_ECHOED = {"k": "camera_matrix", "d": "distortion_coefficients", "width": "image_width", "height": "image_height"}
+"""As `ros2 topic echo` and `rostopic echo` print a CameraInfo."""
+
+
+def _data(matrix: Any) -> Any:
+    return matrix["data"] if isinstance(matrix, dict) else matrix
+
+
+def _opencv(file: Path) -> list[tuple[str, dict[str, Any]]]:
+    """What `cv2.FileStorage` wrote, under ROS's names: of one camera, or the two of OpenCV's stereo calibration."""
     storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_READ)
-    there = {key: name for key, names in _NAMES.items() for name in names if not storage.getNode(name).empty()}
+    if storage.getNode("M2").empty():
+        return [(file.stem, _stored(storage, _NAMES))]
+    pair = (("1", _NAMES), ("2", {**_NAMES, "camera_matrix": ("M2",), "distortion_coefficients": ("D2",)}))
+    return [(f"{file.stem}{number}", _stored(storage, names)) for number, names in pair]
+
+
+def _stored(storage: cv2.FileStorage, known: Mapping[str, tuple[str, ...]]) -> dict[str, Any]:
+    there = {key: name for key, names in known.items() for name in names if not storage.getNode(name).empty()}
     found: dict[str, Any] = {}
     for key, name in there.items():
         node = storage.getNode(name)
@@ -222,4 +250,7 @@ def _config(lens: ForeignLens, file: Path, model: LensModel, numbers: Any, disto
         return CameraConfig(name=lens.name, size_px=lens.size, intrinsics=intrinsics)
     except ValidationError as error:
         first = error.errors()[0]
-        raise CalibrationError(f"{file}: {lens.name}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+        key, told = ".".join(map(str, first["loc"])), first["msg"]
+        if first["loc"][0] == "size_px":
+            key, told = "size", f"{lens.size[0]} x {lens.size[1]} is not of 32 to 8192 pixels a side; correct it"
+        raise CalibrationError(f"{file}: {lens.name}: {key}: {told}") from None

@@ -15,6 +15,7 @@ from tempfile import TemporaryFile
 import cv2
 import numpy as np
 
+from flockd.core.data import LFS_POINTER
 from flockd.core.errors import FlockdError
 from flockd.core.jpeg_header import MAX_IMAGE_PIXELS, cost_fault, jpeg_end
 from flockd.core.messages import Float32Array, UInt8Array
@@ -26,11 +27,13 @@ class DatasetError(FlockdError):
 
 SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp", ".avif"})
 UNREAD_SUFFIXES = frozenset(
-    {".heic", ".heif", ".jxl", ".jp2", ".gif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"}
+    {".heic", ".heif", ".jxl", ".mpo", ".tga", ".exr", ".hdr", ".svg", ".pdf"}
+    | {".jp2", ".gif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"}
     | {".3gp", ".mts", ".ts", ".wmv", ".flv", ".insv"}
 )
 """Kinds of pictures and videos that are not read; those of a folder are reported."""
 _WITH_PAGES = frozenset({".tif", ".tiff", ".webp", ".avif"})
+_PAGES = "has {} pages, of which one would be read; save each as an image"
 _PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND"
 _JPEG = b"\xff\xd8"
 MAX_FILE_BYTES = 1 << 29
@@ -41,11 +44,18 @@ _CHUNK_FRAME = 12
 
 def unread(files: Iterable[Path]) -> str | None:
     """A sentence about the pictures and videos among these that are not read, by kind; None: all are read."""
+    files = list(files)
     counts = Counter(suffix for file in files if (suffix := file.suffix.lower()) in UNREAD_SUFFIXES)
     kinds = ", ".join(f"{count} {suffix}" for suffix, count in sorted(counts.items()))
-    return (
-        f"pictures or videos of kinds that are not read ({kinds}); convert them to JPEG, PNG or MP4" if kinds else None
+    told = (
+        [f"pictures or videos of kinds that are not read ({kinds}); convert them to JPEG, PNG or MP4"] if kinds else []
     )
+    told += [
+        f"{file.name}, which is a link to nothing, or not an ordinary file; restore or delete it"
+        for file in files
+        if file.suffix.lower() in SUFFIXES | VIDEO_SUFFIXES and not (file.is_file() or file.is_dir())
+    ]
+    return ", and ".join(told) or None
 
 
 def in_order(files: Iterable[Path]) -> list[Path]:
@@ -63,11 +73,12 @@ def read_image(path: Path, size: tuple[int, int] | None = None) -> UInt8Array:
     10, 12 or 16 bits the range that they use becomes 8 bits. Raises DatasetError, also for another ``size``.
     """
     # Not IMREAD_COLOR_RGB: OpenCV 5.0.0 garbles TIFF of 16 bits with it.
-    image = cv2.cvtColor(_decoded(path, cv2.IMREAD_COLOR_BGR | cv2.IMREAD_ANYDEPTH), cv2.COLOR_BGR2RGB)
+    decoded = _decoded(path, cv2.IMREAD_COLOR_BGR | cv2.IMREAD_ANYDEPTH)
+    if decoded.dtype not in (np.uint8, np.uint16):
+        raise DatasetError(f"{path}: has pixels of {decoded.dtype}; save it with 8 or 16 bits a channel")
+    image = cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB)
     if image.dtype == np.uint16:
         image = np.right_shift(np.asarray(image, np.uint16), max(int(image.max()).bit_length() - 8, 0))
-    elif image.dtype != np.uint8:
-        raise DatasetError(f"{path}: has pixels of {image.dtype}; save it with 8 or 16 bits a channel")
     if size is not None:
         _check_size(path, image.shape[1::-1], size)
     return np.asarray(image, np.uint8)
@@ -120,6 +131,7 @@ _OTHERS = {
     **dict.fromkeys((b"GIF8", b"P1", b"P2", b"P3", b"\0\0\0\x0cjP"), "is of a format that is not read; save it as PNG"),
     **dict.fromkeys((b"\x1f\x8b", b"PK\x03\x04", b"\x28\xb5\x2f\xfd"), "is packed; unpack it"),
     **dict.fromkeys((b"%PDF", b"<svg", b"<?xml"), "is a document; save its picture as PNG"),
+    LFS_POINTER: "is a pointer of Git LFS; fetch the file with `git lfs pull`",
 }
 """First bytes of files with an image's name that are no image."""
 
@@ -139,7 +151,7 @@ def _fault(data: bytes) -> str | None:
 
 def _pages_fault(path: Path) -> str | None:
     pages = cv2.imcount(str(path)) if path.suffix.lower() in _WITH_PAGES else 1
-    return f"has {pages} pages, of which one would be read; save each as an image" if pages > 1 else None
+    return _PAGES.format(pages) if pages > 1 else None
 
 
 @contextmanager
@@ -171,6 +183,8 @@ def _png_fault(data: bytes) -> str | None:
             return f"the PNG is damaged at byte {at}"
         if data[at + 4 : at + 8] == _PNG_END:
             return None
+        if data[at + 4 : at + 8] == b"acTL" and (pages := int.from_bytes(data[at + 8 : at + 12])) > 1:
+            return _PAGES.format(pages)
         at = end
     return "the PNG ends too early"
 

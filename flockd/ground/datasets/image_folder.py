@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from flockd.core.config.rig import CameraConfig, IntrinsicsConfig
 from flockd.core.errors import ConfigError
 from flockd.core.messages import FloatArray, UInt8Array
 from flockd.flight.geometry import RigidTransform, ZMap
-from flockd.ground.datasets.image_files import SUFFIXES, DatasetError, in_order, read_depth, read_image
+from flockd.ground.datasets.image_files import SUFFIXES, DatasetError, in_order, read_depth, read_image, unread
 
 _UNITS_PER_M = 1000.0
 """Of depth maps, 16 bits a pixel."""
@@ -85,8 +86,13 @@ def open_dataset(path: Path) -> Dataset:
 
 def _files(folder: Path) -> list[Path]:
     files = in_order(file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES)
+    if (others := unread(folder.iterdir())) is not None:
+        raise DatasetError(f"{folder}: has {others}")
     if not files:
         raise DatasetError(f"{folder}: holds no images; put them there")
+    for before, after in pairwise(files):
+        if before.stem == after.stem:
+            raise DatasetError(f"{folder}: has {before.name} and {after.name}; delete one of them")
     return files
 
 

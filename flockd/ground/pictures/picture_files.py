@@ -104,10 +104,10 @@ def find_pictures(
     found: dict[Path, PictureFile] = {}
     for path in paths:
         if path.is_dir():
-            there = [one for one in path.rglob("[!.]*") if one.is_file()]
+            there = [one for one in path.rglob("[!.]*") if not one.is_dir()]
             if copies is not None and path.resolve() in copies.parents:
-                there = [one for one in there if copies not in one.resolve().parents]
-            inside = in_order(one for one in there if one.suffix.lower() in endings)
+                there = [one for one in there if not one.is_file() or copies not in one.resolve().parents]
+            inside = in_order(one for one in there if one.suffix.lower() in endings and one.is_file())
             others = unread(there)
             if not inside:
                 raise UsageError(f"{path}: has {others or 'no images or videos; name the folder that they are in'}")

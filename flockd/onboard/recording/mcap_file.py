@@ -21,6 +21,7 @@ from mcap.records import Attachment, Channel, Chunk, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, Writer
 
+from flockd.core.data import LFS_POINTER
 from flockd.core.errors import FlockdError
 
 CHUNK_BYTES = 100_000
@@ -32,6 +33,7 @@ _MAGIC = b"\x89MCAP0\r\n"
 _UNKNOWN = "it does not begin as MCAP files do); name another file"
 _OTHERS = {
     b"#ROSBAG": "but a bag of ROS 1); make one of ROS 2 of it with `rosbags-convert`",
+    LFS_POINTER[:8]: "but a pointer of Git LFS); fetch the file with `git lfs pull`",
     b"ULog": "but PX4's log); open it in Flight Review or PlotJuggler",
     b"\x28\xb5\x2f\xfd": "but packed by zstd); unpack it with `unzstd`",
     b"\x1f\x8b": "but packed by gzip); unpack it with `gunzip`",

@@ -164,6 +164,13 @@ SLIPS = (
     ("<<: {yaw: hold}", "<<: merge keys"),
     ("? [a]: 1", "a key must be a plain word"),
     ("---", "a second document begins here"),
+    ("autopilot: {address: 'serial:///dev/ttyAMA0'}", "autopilot.address: serial:///dev/ttyAMA0 has no baud rate; "),
+    ("autopilot: {system_id: 255}", "autopilot.system_id: 255 is not at most 250"),  # PX4's largest MAV_SYS_ID
+    ("autopilot: {low_battery_share: 1}", "autopilot.low_battery_share: 1 is not less than 1"),
+    (
+        f"source: {{kind: v4l2, cameras: [{CAMERA[:-1]}, controls: [{{name: a, value: 1}}, {{name: a, value: 2}}]}}]}}",
+        "source.cameras[0].controls[1].name: a is set twice; delete one",
+    ),
     ("autopilot: {address: /dev/ttyAMA0}", "autopilot.address: /dev/ttyAMA0 is not an address; write an address, as"),
     ("telemetry: {listen: ['0.0.0.0:7447']}", "telemetry.listen[0]: '0.0.0.0:7447' is not a zenoh endpoint; write a"),
     (f"source: {{kind: v4l2, cameras: [{CAMERA}], {SLOW}}}", "source: real cameras need real time; delete"),
@@ -366,6 +373,10 @@ def test_steps_that_a_flight_would_wait_for_are_refused(
         ("telemetry.listen", ("tcp/127.0.0.1:7447", "tls/0.0.0.0:70000?x=1"), "has the port 70000"),
         ("telemetry.connect", ("udp/10.0.0.1:65536",), "has the port 65536"),
         ("telemetry.listen", ("tcp/0.0.0.0:0",), "has the port 0; write one from 1 to 65535"),
+        ("autopilot.address", "udpin://192.168.1.300:14540", "has the host 192.168.1.300; write an IP address or a"),
+        ("autopilot.address", "udpin://[::]:14540", "has the host [::]; write an IP address or a computer's name"),
+        ("telemetry.listen", ("tcp/drone 1:7447",), "has the host drone 1; write an IP address or a computer's name"),
+        ("telemetry.connect", ("tcp/[1:2:7447",), "has the host [1:2; write an IP address or a computer's name"),
     ],
 )
 def test_an_address_that_nothing_can_open_is_refused(key: str, value: Any, told: str, tmp_path: Path) -> None:
@@ -378,7 +389,8 @@ def test_an_address_that_nothing_can_open_is_refused(key: str, value: Any, told:
 def test_an_address_may_have_colons_in_its_path_and_every_port(tmp_path: Path) -> None:
     (tmp_path / "drone.yaml").write_text(DRONE, encoding="utf-8")
     by_path = "serial:///dev/serial/by-path/platform-xhci-hcd.1-usb-0:1:1.0-port0:57600"
-    overrides: dict[str, Any] = {"autopilot.address": by_path, "telemetry.listen": ("tcp/0.0.0.0:65535",)}
+    listen = ("tcp/0.0.0.0:65535", "tcp/[fe80::1%eth0]:1", "udp/pi-4_b.local:2", "tls/relay.example.org:3#iface=wlan0")
+    overrides: dict[str, Any] = {"autopilot.address": by_path, "telemetry.listen": listen}
     config = load_drone(tmp_path / "drone.yaml", overrides)
     assert config.autopilot is not None
     assert config.autopilot.address == by_path
@@ -400,6 +412,21 @@ def test_what_is_wrong_with_a_camera_is_told_at_its_own_line(tmp_path: Path) -> 
 def _camera(size: tuple[int, int], **lens: object) -> CameraConfig:
     values = {"fx": 320.0, "fy": 320.0, "cx": size[0] / 2, "cy": size[1] / 2, **lens}
     return CameraConfig(name="front", size_px=size, intrinsics=IntrinsicsConfig.model_validate(values))
+
+
+@pytest.mark.parametrize("turns", [("1.5708", "3.1416", "4.7124"), ("1.57", "3.14", "-1.57")])
+def test_mountings_in_radians_are_refused_and_those_of_a_calibration_are_not(
+    turns: tuple[str, ...], tmp_path: Path
+) -> None:
+    text = (CONFIG / "quadrotor.yaml").read_text(encoding="utf-8")
+    degrees = ("yaw_deg: 90.0", "yaw_deg: 180.0", "yaw_deg: 270.0")
+    for right, wrong in zip(degrees, turns, strict=True):
+        text = text.replace(right, f"yaw_deg: {wrong}")
+    problems = _drone_problems(tmp_path, text)
+    assert [problem.key for problem in problems] == [f"rig.cameras[{n}].extrinsics.yaw_deg" for n in (1, 2, 3)]
+    assert problems[0].message == f"{float(turns[0]):g} is in radians, as all the others are; write degrees"
+    (tmp_path / "drone.yaml").write_text(text.replace(f"yaw_deg: {turns[1]}", "yaw_deg: 179.3"), encoding="utf-8")
+    load_drone(tmp_path / "drone.yaml")
 
 
 def test_how_wide_a_camera_sees() -> None:

@@ -47,6 +47,16 @@ COLMAP = """\
 2 SIMPLE_RADIAL 640 480 650 320 240 -0.1
 """
 """Pixel centres at +0.5."""
+ECHOED = f"""\
+header: {{stamp: {{sec: 1, nanosec: 2}}, frame_id: front}}
+height: 480
+width: 640
+distortion_model: plumb_bob
+d: {PINHOLE}
+k: {ROWS}
+r: [1, 0, 0, 0, 1, 0, 0, 0, 1]
+---
+"""
 
 
 def _filled(text: str, coefficients: list[float], **words: str) -> str:
@@ -68,8 +78,10 @@ def _points() -> FloatArray:
         (_filled(KALIBR, PINHOLE[:4], MODEL="radtan", CAMERA="pinhole"), PINHOLE[:4], K, False),
         (_filled(KALIBR, FISHEYE, MODEL="equidistant", CAMERA="pinhole"), FISHEYE, K, True),
         (COLMAP, PINHOLE[:4], K, False),
+        (ECHOED, PINHOLE, K, False),
+        (ECHOED.replace("k:", "K:").replace("d:", "D:").replace("---", ""), PINHOLE, K, False),
     ],
-    ids=["ros", "ros fisheye", "kalibr", "kalibr fisheye", "colmap"],
+    ids=["ros", "ros fisheye", "kalibr", "kalibr fisheye", "colmap", "ros2 topic echo", "rostopic echo"],
 )
 def test_points_are_where_opencv_images_them(
     text: str, coefficients: list[float], matrix: FloatArray, fisheye: bool, tmp_path: Path
@@ -94,6 +106,24 @@ def test_what_opencv_stores_is_read_under_its_names_and_needs_a_size(tmp_path: P
     assert main(["calibrate", "import", str(file), "--out", str(out), "--size", "640x480"]) == 0
     (camera,) = load_drone(out).rig.cameras
     assert (camera.size_px, camera.intrinsics.cx, camera.intrinsics.distortion) == ((640, 480), 324.6, tuple(PINHOLE))
+
+
+def test_both_cameras_of_opencvs_stereo_calibration_are_read(tmp_path: Path) -> None:
+    file, out = tmp_path / "pair.yml", tmp_path / "ours.yaml"
+    storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
+    for number, k in (("1", PINHOLE), ("2", PINHOLE[:4])):
+        storage.write(f"M{number}", K)
+        storage.write(f"D{number}", np.array(k))
+    storage.release()
+    assert main(["calibrate", "import", str(file), "--out", str(out), "--size", "640x480"]) == 0
+    found = {camera.name: camera.intrinsics.distortion for camera in load_drone(out).rig.cameras}
+    assert found == {"pair1": tuple(PINHOLE), "pair2": tuple(PINHOLE[:4])}
+
+
+def test_another_size_than_the_files_is_refused(tmp_path: Path, capsys: Capture) -> None:
+    (file := tmp_path / "theirs.txt").write_text(COLMAP, encoding="utf-8")
+    assert main(["calibrate", "import", str(file), "--out", str(tmp_path / "x.yaml"), "--size", "1280x960"]) == 1
+    assert "camera1: is of 640 x 480 images, and --size is another; leave it out" in capsys.readouterr().err
 
 
 def _brown(plane: FloatArray, k: list[float], prism: tuple[float, float] = (0.0, 0.0)) -> FloatArray:
@@ -273,6 +303,10 @@ def test_a_lens_without_an_equal_is_refused_with_how_far_the_nearest_is_off(
             "head_camera: intrinsics.cx: 324.6 is 51% of the image",
         ),
         ("cam0: 5\n", "holds no camera; give Kalibr's camchain"),
+        (_filled(ROS, PINHOLE, MODEL="plumb_bob").replace("640", "640.5"), "width and height of Head Camera, as whole"),
+        (_filled(ROS, PINHOLE, MODEL="plumb_bob").replace("640", "-640"), "head_camera: size: -640 x 480 is not of 32"),
+        (ECHOED + "---\n" + ECHOED, "holds 2 documents; write each to a file of its own"),
+        ("1 PINHOLE 640 480 650 650 320 240\n" * 2, "has two cameras of the name camera1; give each its own"),
         ("rig: {}\n", "is a drone's own file; copy the cameras of its `rig`"),
         ("just a text\n", "lacks or garbles keys with values; give Kalibr's camchain"),
         (

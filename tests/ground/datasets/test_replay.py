@@ -104,6 +104,10 @@ def flip_a_bit(folder: Path) -> None:
     file.write_bytes(data)
 
 
+def twice(folder: Path) -> None:
+    shutil.copy(file := third(folder / "images"), file.with_suffix(".jpg"))
+
+
 def cut_jpeg(folder: Path) -> None:
     _, data = cv2.imencode(".jpg", np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8))
     third(folder / "images").write_bytes(data.tobytes()[:-500])
@@ -129,6 +133,8 @@ ODD = "200 0 160\n0 200 120\n0 0 one\n"
         (cut_short, 1, ".png: the PNG ends too early"),
         (flip_a_bit, 1, ".png: the PNG is damaged at byte"),
         (cut_jpeg, 1, ".png: the JPEG ends too early"),
+        (lambda folder: (folder / "images/1.heic").touch(), 1, "images: has pictures or videos of kinds that are not"),
+        (twice, 1, "images: has 00016.jpg and 00016.png; delete one of them"),
         (lambda folder: third(folder / "images").unlink(), 1, "depth/00016.png: its image is missing"),
         (lambda folder: shutil.rmtree(folder / "images"), 1, "is no folder of images; it needs images/"),
         (lambda folder: third(folder / "depth").unlink(), 1, "depth/00016.png: is missing; each image needs its depth"),

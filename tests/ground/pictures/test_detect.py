@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import resource
 import shutil
 import signal
 import struct
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -280,6 +282,29 @@ def test_a_size_that_no_drone_has_is_refused(capsys: Capture, size_m: str) -> No
     assert f"argument --drone-size: '{size_m}' is not a size in metres, 0.05 to 5" in capsys.readouterr().err
 
 
+def _animated() -> bytes:
+    """A PNG that says that it has two frames."""
+    png = cv2.imencode(".png", np.zeros((64, 64, 3), np.uint8))[1].tobytes()
+    control = b"acTL" + struct.pack(">II", 2, 0)
+    header = 33  # bytes of the signature and IHDR
+    return png[:header] + struct.pack(">I", 8) + control + struct.pack(">I", zlib.crc32(control)) + png[header:]
+
+
+def test_links_to_nothing_and_pipes_among_pictures_are_named(capsys: Capture, tmp_path: Path) -> None:
+    shutil.copy(NEAR, tmp_path / "near.jpg")
+    (tmp_path / "gone.jpg").symlink_to(tmp_path / "nowhere.jpg")
+    assert main(["detect", str(tmp_path), *FOV]) == 1
+    named = (
+        f"left out: {tmp_path}: gone.jpg, which is a link to nothing, or not an ordinary file; restore or delete it\n"
+    )
+    assert named in capsys.readouterr().err
+    (tmp_path / "near.jpg").unlink()
+    os.mkfifo(tmp_path / "pipe.png")
+    said = told(capsys, 2, "detect", tmp_path, *FOV)
+    assert "gone.jpg, which" in said
+    assert "pipe.png, which" in said
+
+
 @pytest.mark.parametrize(
     ("name", "content", "sentence"),
     [
@@ -287,13 +312,16 @@ def test_a_size_that_no_drone_has_is_refused(capsys: Capture, size_m: str) -> No
         ("a.jpg", b"no picture", "is no image"),
         ("a.png", b"GIF89a" + bytes(99), "is of a format that is not read; save it as PNG"),
         ("a.jpg", b"\x1f\x8b\x08" + bytes(99), "is packed; unpack it"),
+        ("a.jpg", b"version https://git-lfs.github.com/spec/v1\noid", "is a pointer of Git LFS; fetch the file with"),
+        ("a.tif", cv2.imencode(".tif", np.zeros((64, 64), np.int16))[1].tobytes(), "has pixels of int16; save it with"),
+        ("a.png", _animated(), "has 2 pages, of which one would be read; save each as an image"),
         ("a.jpg", NEAR.read_bytes()[:9000], "the JPEG ends too early"),
         ("a.jpg", b"P6\n60000 60000\n255\n", "has more pixels than any camera, or none"),
         ("a.jpg", b"P6\n600 600\n255\n", "is no image"),
         ("a.ppm", b"P6\n40 31\n255\n" + bytes(40 * 31 * 3), "is 40 x 31 pixels, and 32 x 32 are needed"),
         ("a.mp4", b"no video", "cannot be decoded as a video"),
     ],
-    ids=["empty", "text", "GIF", "gzip", "cut", "huge PPM", "cut PPM", "small", "video"],
+    ids=["empty", "text", "GIF", "gzip", "LFS", "signed", "animated", "cut", "huge PPM", "cut PPM", "small", "video"],
 )
 def test_a_picture_that_cannot_be_read_ends_it(
     capsys: Capture, tmp_path: Path, name: str, content: bytes, sentence: str

@@ -100,6 +100,17 @@ FLIGHTS = (
     ("", "faults: [{drone: 3, camera: front}]", "2: faults[0].drone: is 3, but there are 2"),
     ("", "faults: [{drone: 1, camera: top}]", "2: faults[0].camera: is not in the rig"),
     ("", "faults: [{drone: 1, camera: front, begin_s: 5, end_s: 4}]", "2: faults[0].end_s: is not after begin_s 5"),
+    (
+        "- {position_m: [0, 5, -4]}",
+        "- {position_m: [0, 5, -4], by_hand: true}\nfaults: [{drone: 2, camera: front}]",
+        "6: faults[0].drone: is 2, which is flown by hand; write one of flockd's",
+    ),
+    ("[0, 0, -4]", "[473977400, 0, -4]", "4: vehicles[0].position_m[0]: 473977400 is not at most 100000"),
+    ("[0, 0, -4]}", "[0, 0, -4], velocity_m_s: [1000, 0]}", "4: vehicles[0].velocity_m_s[0]: 1000 is not at most 50"),
+    ("", "sensors: {range_finder: {min_m: 30}}", "2: sensors.range_finder.min_m: 30 is not below max_m 20; write a"),
+    ("", "detections: {false_m: [20, 10, 5]}", "2: detections.false_m: falls; write the 10th, the 50th and the 90th"),
+    ("", "world: {ground_relief_m: 50}", "2: world.ground_relief_m: 50 is not at most 2"),
+    ("", "world: {clearance_m: 5000}", "2: world.clearance_m: 5000 is not at most 100"),
     ("", "world: {drone_family: 99}", "2: world.drone_family: 99 is not at most 13; write a whole number from 0 to"),
     ("", "world:\n  obstacles:\n    kind: jungle", "4: world.obstacles.kind: jungle is not known; write `forest` or"),
     ("", TREES + ": 900, kind: forest}}", "2: world.obstacles.trees_per_hectare: 900 is not at most 400"),
@@ -124,12 +135,20 @@ def test_a_flight_that_cannot_be_flown_is_refused_at_its_line(tmp_path: Path, ol
     assert str(problem).startswith(f"scenario.yaml:{told}")
 
 
-def test_drones_that_begin_out_of_sight_are_warned_of(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_drones_out_of_sight_and_faults_after_the_end_are_warned_of(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """The third is 500 m away; 60 m is `perception.detection.max_range_m`."""
     (tmp_path / "drone.yaml").write_text(DRONE, encoding="utf-8")
     (scenario := tmp_path / "two.yaml").write_text(SCENARIO, encoding="utf-8")
     assert main(["config", "check", str(scenario)]) == 0
     assert not capsys.readouterr().err
+    late = "faults: [{drone: 1, camera: front, begin_s: 110}]\ntakeovers: [{drone: 1, time_s: 200, to: hold}]\n"
+    scenario.write_text(SCENARIO + late, encoding="utf-8")
+    assert main(["config", "check", str(scenario)]) == 0
+    told = [line.partition(": ")[2].removeprefix(f"{scenario}: ") for line in capsys.readouterr().err.splitlines()]
+    after = "is not before the flight's end, duration_s 110: it will not happen; write an earlier one"
+    assert told == [f"faults[0].begin_s: 110 {after}", f"takeovers[0].time_s: 200 {after}"]
     scenario.write_text(SCENARIO + "  - {position_m: [400, 305, -4]}\n", encoding="utf-8")
     assert main(["config", "check", str(scenario)]) == 0
     (warned,) = capsys.readouterr().err.splitlines()
