@@ -31,6 +31,8 @@ class Moment:
     """(2,) latitude and longitude of home; None: not known."""
     order: MissionOrder | None = None
     """An operator's new order; None: no new one."""
+    heading_rad: float | None = None
+    """The heading commanded last, clockwise from north; None: not known."""
 
     @property
     def flock(self) -> FloatArray | None:

@@ -350,6 +350,7 @@ class FlockPilot:
                 middle=middle_of(places[:, :2]),
                 home_deg=vehicle.home_deg,
                 order=self._order,
+                heading_rad=self._yaw_rad,
             )
         )
         self._order = None

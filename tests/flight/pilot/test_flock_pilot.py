@@ -12,7 +12,16 @@ import pytest
 
 from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.config.mission import MissionParameters
-from flockd.core.messages import SECTORS, Float32Array, Frame, FrameSet, Reason, ReasonKind, VehicleState
+from flockd.core.messages import (
+    SECTORS,
+    Float32Array,
+    Frame,
+    FrameSet,
+    MissionOrder,
+    Reason,
+    ReasonKind,
+    VehicleState,
+)
 from flockd.flight.geometry import RigCamera, rotation_angle_deg, rotation_from_euler
 from flockd.flight.perception import Observation, SceneMaps
 from flockd.flight.pilot import FlockPilot
@@ -222,6 +231,15 @@ def test_a_heading_to_hold_is_the_first_good_one(
 ) -> None:
     """With `course`, where the mission has none."""
     assert blown_about(yaw, *headings_rad, height_m=height_m) == [one and pytest.approx(one) for one in asked_rad]
+
+
+def test_an_order_turns_a_hovering_drone_no_faster_than_images_allow() -> None:
+    """It looks east, and is to fly south-west: 0.2 rad/s, in steps of a second."""
+    pilot, asked = FlockPilot(changed(ALONE.drone, mission=MissionParameters(kind="hover")), NEVER_ASKED), []
+    for i, order in enumerate((None, MissionOrder(velocity=np.array([-1.0, -1.0])), None)):
+        state = vehicle(float(i), R_ned_body=rotation_from_euler(0.0, 0.0, math.pi / 2))
+        asked.append(pilot.step(frames(float(i)), state, order=order).command.yaw_rad)
+    assert asked == pytest.approx([math.pi / 2 + 0.2 * i for i in range(3)])
 
 
 def test_input_that_cannot_be_is_refused_and_the_next_step_is_as_if_it_had_not_come(flyer: Flyer) -> None:
