@@ -6,6 +6,7 @@ from __future__ import annotations
 import atexit
 import errno
 import importlib.util
+import io
 import os
 import sys
 from collections.abc import Sequence
@@ -74,6 +75,11 @@ def program() -> NoReturn:
     A library's thread that asks for Python while the interpreter takes itself down aborts the process, by SIGABRT, and
     its exit code is lost: a service manager would start again what a wrong configuration has ended.
     """
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed by whoever started flockd; a file that it writes would take its number
+            setattr(sys, name, Path(os.devnull).open("w", encoding="utf-8"))  # noqa: SIM115 - until the end
+    if isinstance(sys.stdout, io.TextIOWrapper):  # as stderr does; not every terminal's encoding has every character
+        sys.stdout.reconfigure(errors="backslashreplace")
     code = main()
     atexit._run_exitfuncs()  # what libraries have asked for; there is no public name
     sys.stdout.flush()

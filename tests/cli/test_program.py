@@ -45,6 +45,37 @@ def test_what_is_printed_last_is_not_lost() -> None:
     assert ended.stdout.startswith("model "), "to a pipe, which is written when it is full or flushed"
 
 
+SAYS = """
+import sys, flockd.cli
+
+def main():
+    from flockd.cli.output import say, say_table
+    say_table(("heights",), [("4.0\\u20135.0 m",)])
+    say(str(3))
+    return 0
+
+flockd.cli.main = main
+flockd.cli.program()
+"""
+
+
+def test_what_the_terminals_encoding_lacks_is_escaped() -> None:
+    """A dash, in Latin 1: the report of a flight that had been flown ended in a traceback."""
+    ended = subprocess.run(
+        [sys.executable, "-c", SAYS], cwd=ROOT, env={**os.environ, "PYTHONIOENCODING": "latin-1"}, check=False,
+        capture_output=True, timeout=60.0,
+    )  # fmt: skip
+    assert (ended.returncode, ended.stderr) == (0, b"")
+    assert [line.rstrip() for line in ended.stdout.splitlines()] == [b"heights", rb"4.0\u20135.0 m", b"3"]
+
+
+def test_a_closed_output_is_none() -> None:
+    """As with `>&-` in a shell."""
+    command = ["sh", "-c", '"$0" -c "$1" >&-', sys.executable, SAYS]
+    ended = subprocess.run(command, cwd=ROOT, check=False, capture_output=True, timeout=60.0)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (0, b"", b"")
+
+
 def test_ctrl_c_while_it_is_imported_ends_it_without_a_traceback() -> None:
     interrupts = "import sys, flockd; sys.modules['flockd.cli'] = type(sys)('flockd.cli')\n"
     interrupts += (
