@@ -10,6 +10,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
+from flockd.core.errors import UsageError
 from flockd.core.messages import NO_STATUS, FloatArray, MissionStatus, Neighbour, ObstacleRanges, Setpoint, Wanted
 from flockd.flight.obstacles import nearest_points
 from flockd.flight.safety import (
@@ -183,7 +184,17 @@ class ControlLoop:
     """
 
     def __init__(self, scenario: ScenarioConfig, *, gated: bool = True) -> None:
-        """Not `gated`: setpoints are what the pilots ask for."""
+        """Not `gated`: setpoints are what the pilots ask for.
+
+        Raises UsageError for steps so far apart that gates would send nothing before the next one.
+        """
+        oldest_s = scenario.drone.step_s + scenario.step_latency_s
+        silent_s = scenario.drone.safety.gate.command_timeout_s
+        if gated and oldest_s > silent_s:
+            raise UsageError(
+                f"a command gets {oldest_s:g} s old, with drone.step_s {scenario.drone.step_s:g} and its latency, and "
+                f"gates send none above safety.gate.command_timeout_s {silent_s:g}; write a smaller step_s"
+            )
         self._scenario, self._step_s = scenario, scenario.drone.step_s
         self._drones = {i: _Drone(scenario, i) for i, one in enumerate(scenario.vehicles) if gated and not one.by_hand}
         self._starts = np.array([vehicle.position_m for vehicle in scenario.vehicles])

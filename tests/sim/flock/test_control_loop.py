@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from flockd.core.data import data_path
+from flockd.core.errors import UsageError
 from flockd.core.messages import FloatArray, Setpoint, Wanted
 from flockd.flight.safety import Action, Event, Gate, Objection, Permission, Request, Verdict
 from flockd.review.metrics import min_distance
@@ -40,6 +41,16 @@ def _flown(scenario: ScenarioConfig, vehicles: Vehicles) -> tuple[ControlLoop, F
         commands = flock.step(float(time_s), vehicles.position, vehicles.velocity)
         loop.fly(float(time_s), vehicles, commands)
     return loop, np.array(places)
+
+
+def test_steps_that_gates_would_not_bridge_are_refused_before_the_flight() -> None:
+    """A gate sends nothing older than 1.5 s; 1.2 s and a latency of 0.25 s are less, 1.3 s and that are more."""
+    paper = data_path("config") / "paper_flight.yaml"
+    flown, late = (load_scenario(paper, {"drone.step_s": step_s, "duration_s": 5.2}) for step_s in (1.2, 1.3))
+    assert len(fly(flown, perception="truth").log.time_s) == 4
+    with pytest.raises(UsageError, match=r"1\.55 s old, with drone\.step_s 1\.3 .*command_timeout_s 1\.5; write a"):
+        fly(late, perception="truth")
+    assert len(fly(late, perception="truth", gated=False).log.time_s) == 4
 
 
 def test_in_calm_air_nobody_is_held_or_slowed_by_wind() -> None:
