@@ -43,7 +43,7 @@ PlainName = Annotated[str, text(r"^[a-z0-9_-]+$", "a name, of small letters, dig
 
 
 def checked_port(address: str) -> str:
-    """Raises ValueError for a number that is no network port, for 0, which means any port, and for an impossible host."""
+    """Raises ValueError for a number that is no network port, for 0 (any port), and for an impossible host."""
     kind, _, rest = address.partition("/")
     found = re.search(r"^/?(.+):(\d+)(?:[?#].*)?$", rest)
     if found and kind.rstrip(":") in _WITH_PORTS:
