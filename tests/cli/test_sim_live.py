@@ -176,7 +176,9 @@ async def test_a_flock_is_disturbed_and_begun_again_from_the_page_and_filmed(tmp
         await page.until(lambda: page.rows["drone1"]["neighbours"] == 1)
 
         await page.control("gusts", gust_m_s=1.0)
-        await page.until(lambda: any("off the setpoints" in why for row in page.rows.values() for why in row["why"]))
+        await page.until(
+            lambda: any("differs from its setpoints" in why for row in page.rows.values() for why in row["why"])
+        )
         assert page.now["gust_m_s"] == 1.0
 
         first_s = page.now["time_s"]

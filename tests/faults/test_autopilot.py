@@ -392,7 +392,7 @@ async def test_where_the_autopilot_limits_setpoints_flockd_asks_for_no_more_and_
         fastest_m_s = max(np.linalg.norm(demand.velocity) for _, demand in list(fake_autopilot.setpoints))
         assert fastest_m_s <= 0.5 + 1e-6
         assert fake_autopilot.mode == "OFFBOARD"
-        assert not any("another program" in event or "off the setpoints" in event for event in ship.events)
+        assert not any("another program" in event or "differs from its setpoints" in event for event in ship.events)
 
 
 @pytest.mark.fault("frame-jumps", within_s=2.0)
