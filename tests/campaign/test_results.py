@@ -93,9 +93,8 @@ def test_another_campaign_is_refused(plan: Plan, tmp_path: Path) -> None:
         UsageError, match=r"`campaign\.vary\.drone\.flocking\.cohesion\.values` was \[0\.1, 0\.2\] and is"
     ):
         flown(changed, tmp_path / "out", Shuffled(1))
-    cases = [
-        Plan.load(campaign_file(tmp_path, GRID + f"cases: {{{order}}}\n")) for order in ("b: {}, a: {}", "a: {}, b: {}")
-    ]
+    orders = "b: {duration_s: 9.0}, a: {}", "a: {}, b: {duration_s: 9.0}"
+    cases = [Plan.load(campaign_file(tmp_path, GRID + f"cases: {{{order}}}\n")) for order in orders]
     flown(cases[0], tmp_path / "cases", Shuffled(1))
     with pytest.raises(UsageError, match="entries of `cases` in another order"):
         flown(cases[1], tmp_path / "cases", Shuffled(1))

@@ -23,9 +23,6 @@ Rules of the Air, 3.2.2.2)."""
 _COMES_M_S, _COMES_S = 0.5, 2 * HORIZON_S
 """Least closing speed of a neighbour that the drone sidesteps instead of backing off, and time within which it would be
 too near."""
-_RING = 24
-_SPEEDS = 1.0, 0.5
-"""Shares of the highest speed that are tried in all directions if no velocity keeps clear of all."""
 
 
 class Passing:
@@ -76,8 +73,8 @@ class Passing:
         Optimal reciprocal collision avoidance (J. van den Berg, S. Guy, M. Lin, D. Manocha, "Reciprocal n-body
         collision avoidance", 2011): each neighbour permits one half-plane of velocities, so that the distance is kept
         for `HORIZON_S` if both take their share. One that is nearer already may come no nearer, and the law separates
-        them. Without conflict the result is `wanted`. If no velocity satisfies all half-planes, it is the one that
-        violates them least.
+        them. Without conflict the result is `wanted`. A half-plane is violated where satisfying it would take more than
+        1 / `_SHARE` times as much change of velocity.
         """
         distance_m, max_speed_m_s = self._law.parameters.separation_distance_m, self._law.parameters.max_speed_m_s
         ranges = np.hypot(offsets[:, 0], offsets[:, 1])
@@ -94,23 +91,22 @@ class Passing:
 def _clearest(
     wanted: FloatArray, planes: Iterable[tuple[FloatArray, float, float]], max_speed_m_s: float, limits: Limits
 ) -> FloatArray:
-    """The velocity (2,) m/s that violates the half-planes least, and of those the nearest to `wanted`."""
+    """The velocity (2,) m/s with the least sum of its distance from `wanted` and the largest violation / `_SHARE`.
+
+    An exact penalty: it is the nearest velocity in all half-planes, unless those are nearly opposite and meet far away.
+    There the least violation alone would be bought with the highest speed, to a side.
+    """
     normals, least = np.reshape([one[0] for one in planes], (-1, 2)), np.array([one[1] for one in planes])
     if (normals @ wanted >= least - ROUNDING_M_S).all():
         return wanted
     towards, most_m_s = (one[limits[1] < max_speed_m_s] for one in limits)  # the others do not bind
     across, at_m_s = np.vstack([normals, towards]), np.concatenate([least, most_m_s])
     feet = wanted + (at_m_s - across @ wanted)[:, None] * across
-    tried = np.vstack([feet, crossings(across, at_m_s)])
+    tried = np.vstack([np.zeros(2), feet, crossings(across, at_m_s)])
     tried *= np.minimum(1.0, max_speed_m_s / np.maximum(np.linalg.norm(tried, axis=1), ROUNDING_M_S))[:, None]
     tried = tried[(tried @ towards.T <= most_m_s + ROUNDING_M_S).all(axis=1)]
-    angles = np.arange(_RING) * (2 * math.pi / _RING)
-    ring = np.column_stack([np.cos(angles), np.sin(angles)])
-    fastest = (most_m_s / np.maximum(ring @ towards.T, ROUNDING_M_S)).min(axis=1, initial=max_speed_m_s)[:, None]
-    tried = np.vstack([tried, *(np.minimum(max_speed_m_s * share, fastest) * ring for share in _SPEEDS)])
-    off = ROUNDING_M_S * np.round(np.maximum(least - tried @ normals.T, 0.0).max(axis=1) / ROUNDING_M_S)
-    best = tried[off == off.min()]
-    nearest: FloatArray = best[np.argmin(np.linalg.norm(best - wanted, axis=1))]
+    off = np.maximum(least - tried @ normals.T, 0.0).max(axis=1)
+    nearest: FloatArray = tried[np.argmin(np.linalg.norm(tried - wanted, axis=1) + off / _SHARE)]
     return nearest
 
 

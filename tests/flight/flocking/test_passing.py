@@ -105,6 +105,19 @@ def test_it_flies_no_faster_to_a_side_than_the_gate_lets_it(most_m_s: float) -> 
     assert 0.0 < velocity[1] <= most_m_s
 
 
+def test_it_does_not_dash_aside_for_a_conflict_that_it_cannot_resolve() -> None:
+    """A mate comes from the right, one is faster behind, and the gate blocks the way ahead: seen in a flight by sight,
+    which dashed aside at 2 m/s."""
+    own, offsets = np.array([0.91, 0.2]), np.array([[-0.67, 1.63, 0.51], [-2.75, -1.49, -0.49]])
+    blocked = np.array([[0.895, 0.446], [-0.379, 0.926]]), np.zeros(2)
+    passing = Passing(FlockingLaw(PARAMETERS), 3.0)
+    velocity = passing.clear(
+        np.array([0.89, 0.25]), own, offsets, np.array([[0.83, -0.03], [0.91, 0.34]]), [1, 5], blocked
+    )
+    assert np.hypot(*velocity) < 1.0
+    assert (blocked[0] @ velocity <= 1e-6).all()
+
+
 @pytest.mark.parametrize("avoids", [True, False])
 @pytest.mark.parametrize("angle_deg", [180.0, 135.0, 90.0, 45.0])
 def test_two_on_a_course_to_meet_pass_at_the_separation(angle_deg: float, *, avoids: bool) -> None:
