@@ -165,8 +165,7 @@ class Daemon:
         telemetry.announce(config.name, about, commands.handle, previews.picture)
         return Components(
             link=link, gate=gate, streamer=streamer, source=self._source, pilot_loop=pilot_loop, networks=networks,
-            control=control,
-            requests=requests, refusals=RefusalWatch(link, sinks.event, clock), sinks=sinks,
+            control=control, requests=requests, refusals=RefusalWatch(link, sinks.event, clock), sinks=sinks,
             texts=StateTexts(link.send_text, clock), telemetry=telemetry, commands=commands, lag=lag,
             thermometer=thermometer, dead_tasks=dead_tasks,
         )  # fmt: skip

@@ -214,12 +214,7 @@ class OrderChecks:
 class MissionOrders:
     """Implements `Missions`."""
 
-    def __init__(
-        self,
-        config: DroneConfig,
-        pilot_loop: PilotLoop,
-        vehicle: Callable[[], VehicleState | None],
-    ) -> None:
+    def __init__(self, config: DroneConfig, pilot_loop: PilotLoop, vehicle: Callable[[], VehicleState | None]) -> None:
         """``vehicle``: the vehicle's newest state, on any thread."""
         self._config, self._pilot_loop, self._vehicle = config, pilot_loop, vehicle
 
