@@ -22,7 +22,7 @@ ROOT = Path(__file__).parents[1]
 LINES = {
     "flockd/core": 3_350,
     "flockd/flight": 10_060,
-    "flockd/onboard": 9_360,
+    "flockd/onboard": 9_370,
     "flockd/fleet": 2_740,
     "flockd/ground": 5_280,
     "flockd/review": 3_600,
