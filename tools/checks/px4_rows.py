@@ -49,6 +49,8 @@ MOST_OFF_M_S = 0.15
 CLOSEST_M, HEIGHT_M = 1.0, 0.7
 NEAR_M, FOLLOWS_M = 2.0, 10.0
 """How near to a goal the flock's middle has to come, or the drone flown by hand; and all drones, to the last one."""
+APART_M = 40.0
+"""Between the drones of small pictures: these show none of the others, whose size in them is a pixel."""
 _LENS = {"fx": 64.0, "fy": 64.0, "cx": 64.0, "cy": 48.0}
 _RIG = {
     "cameras": [
@@ -232,7 +234,7 @@ def _scenario(flight: Flight, folder: Path) -> ScenarioConfig:
     drone = {"rig": _RIG, "own_velocity": "autopilot", "perception": {"flow": "dis"}}
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "small.yaml").write_text(json.dumps(drone), encoding="utf-8")
-    vehicles = [{"position_m": [0.0, 8.0 * i, -4.0]} for i in range(flight.drones)]
+    vehicles = [{"position_m": [0.0, APART_M * i, -4.0]} for i in range(flight.drones)]
     written = {
         "scenario": flight.name, "duration_s": flight.duration_s, "drone": "small.yaml", "vehicles": vehicles,
         "mission": dict(flight.mission),

@@ -132,7 +132,8 @@ class RigConfig(Section):
     @model_validator(mode="after")
     def _turns_are_degrees(self) -> Self:
         """All turns about the vertical, two or more, that are multiples of pi/4 are radians."""
-        turned = {n: camera.extrinsics.yaw_deg for n, camera in enumerate(self.cameras) if camera.extrinsics.yaw_deg}
+        yaws = {n: camera.extrinsics.yaw_deg for n, camera in enumerate(self.cameras)}
+        turned = {n: yaw for n, yaw in yaws.items() if abs(yaw) > _ROUNDED_RAD}
         off = [math.remainder(abs(yaw), math.pi / 4) for yaw in turned.values() if abs(yaw) < 2.0 * math.pi]
         if len(off) == len(turned) > 1 and max(map(abs, off)) < _ROUNDED_RAD:
             told = "is in radians, as all the others are; write degrees"

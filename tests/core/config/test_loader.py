@@ -15,7 +15,7 @@ from pydantic import ValidationError
 from flockd.cli import main
 from flockd.core.config import load_drone
 from flockd.core.config.document import core_scalar
-from flockd.core.config.rig import CameraConfig, IntrinsicsConfig, field_of_view_deg
+from flockd.core.config.rig import CameraConfig, ExtrinsicsConfig, IntrinsicsConfig, RigConfig, field_of_view_deg
 from flockd.core.errors import ConfigError, ConfigProblem, ModelError
 from flockd.flight.perception import load_networks
 
@@ -427,6 +427,12 @@ def test_mountings_in_radians_are_refused_and_those_of_a_calibration_are_not(
     assert problems[0].message == f"{float(turns[0]):g} is in radians, as all the others are; write degrees"
     (tmp_path / "drone.yaml").write_text(text.replace(f"yaw_deg: {turns[1]}", "yaw_deg: 179.3"), encoding="utf-8")
     load_drone(tmp_path / "drone.yaml")
+    near = {f"front{n}": ExtrinsicsConfig(yaw_deg=0.004 - 0.005 * n) for n in (0, 1)}
+    RigConfig(
+        cameras=tuple(
+            _camera((640, 480)).model_copy(update={"name": name, "extrinsics": one}) for name, one in near.items()
+        )
+    )
 
 
 def test_how_wide_a_camera_sees() -> None:

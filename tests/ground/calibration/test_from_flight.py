@@ -200,7 +200,7 @@ def test_the_doctor_names_a_camera_of_which_the_flight_showed_nothing_though_it_
     left, rig = examined(monkeypatch, drone_config(), tmp_path, seen("front", *right), unseen)
     assert (left.level, left.about) == (Level.WARNING, "camera left")
     assert rig.level is Level.PASS
-    assert rig.measured.endswith("saw 1 cameras as they are configured")
+    assert rig.measured.endswith("1 cameras were as configured")
     (left,) = examined(monkeypatch, drone_config(), tmp_path, seen("front", *right), replace(unseen, elsewhere=True))
     assert (left.level, left.about) == (Level.FAILURE, "camera left"), "once"
     still = [replace(unseen, camera=name) for name in ("front", "left")]
@@ -222,4 +222,4 @@ def test_the_doctor_compares_the_newest_recording_with_the_configuration(
     assert "flockd calibrate rig --from-flight" in finding.fix
     other = config.model_copy(update={"rig": config.rig.model_copy(update={"time_offset_s": 0.01})})
     (finding,) = examined(monkeypatch, other, tmp_path, *found)
-    assert "is another than in the last flight" in finding.measured
+    assert "differs from that of the last flight" in finding.measured

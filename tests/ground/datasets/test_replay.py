@@ -151,9 +151,9 @@ ODD = "200 0 160\n0 200 120\n0 0 one\n"
         (lambda folder: (folder / "K.txt").write_text(ODD), 1, "K.txt:3: does not fit; it needs a 3x3 matrix"),
     ],
     ids=[
-        "cut short", "flipped bit", "cut JPEG", "no image", "no images", "no depth map", "a pose too few",
-        "no rotation", "lost track", "no depth", "coarse depth", "small depth", "small image",
-        "doubled calibration", "halved calibration", "no calibration", "odd calibration",
+        "cut short", "flipped bit", "cut JPEG", "an image of no known kind", "an image twice", "no image", "no images",
+        "no depth map", "a pose too few", "no rotation", "lost track", "no depth", "coarse depth", "small depth",
+        "small image", "doubled calibration", "halved calibration", "no calibration", "odd calibration",
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_one_sentence(
