@@ -89,7 +89,7 @@ def video_file(draft: Path, target: Path, rate_hz: float) -> Iterator[Callable[[
         yield write
     finally:
         video.release()
-    if written and cv2.VideoCapture(str(draft)).get(cv2.CAP_PROP_FRAME_COUNT) != written:
+    if written and not cv2.VideoCapture(str(draft)).isOpened():
         raise UsageError(f"{target}: cannot be written whole, as on a full disk; make room, or name another place")
 
 
