@@ -11,7 +11,6 @@ import json
 import logging
 import math
 import socket
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
@@ -41,7 +40,6 @@ from flockd.onboard.autopilot.autopilot_status import (
     Firmware,
     FlightMode,
 )
-from flockd.onboard.autopilot.frequent_messages import FrequentMessages
 from flockd.onboard.autopilot.mavlink_messages import Fields, ReceivedMessages, result_text, text_chunks
 from flockd.onboard.autopilot.refusal_reasons import REMEDIES_OF_RESULTS
 from flockd.onboard.autopilot.refusals import Refusal
@@ -150,10 +148,6 @@ class AutopilotLink:
         self._time_syncs: deque[int] = deque(maxlen=MOST_OPEN)
         """Start times of unanswered exchanges, in nanoseconds of this computer's clock."""
         self._text_ids = cycle(range(1, 0x10000))
-        self._receiving = threading.Lock()
-        if port is not None:
-            frequent = FrequentMessages(self._system_id, AUTOPILOT_COMPONENT, self._add)
-            port.hand_to(lambda data: (rest := frequent.without(data)) and mavsdk.pass_received_raw_bytes(rest))
         for name in (*RECEIVED, TIME_SYNC):
             self._direct.subscribe_message(name, self._receive)
 
@@ -416,12 +410,7 @@ class AutopilotLink:
         elif message.message_name == TIME_SYNC:
             self._take_time(json.loads(message.fields_json), now)
         else:
-            self._add(message.message_name, json.loads(message.fields_json))
-
-    def _add(self, name: str, fields: Fields) -> None:
-        """Called on MAVSDK's thread and on the serial port's."""
-        with self._receiving:
-            self.received.add(name, fields, self._clock())
+            self.received.add(message.message_name, json.loads(message.fields_json), now)
 
     def _take_time(self, fields: Fields, now: float) -> None:
         """Takes the reply to a time exchange; the autopilot's own requests use the same message and are ignored."""

@@ -11,12 +11,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mavsdk.plugins.mavlink_direct import MavlinkMessage
 
 from flockd.core.config.autopilot import AutopilotParameters
 from flockd.core.messages import Setpoint
 from flockd.onboard.autopilot.autopilot_status import AutopilotError
-from flockd.onboard.autopilot.frequent_messages import LAYOUTS
 from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from tests.calm import clock
@@ -48,23 +46,6 @@ async def test_at_rest_it_costs_under_three_hundredths_of_a_core(
         began_s, spent_s = time.monotonic(), _spent_s(others)
         await asyncio.sleep(6.0)
         assert _spent_s(others) - spent_s < ALLOWED_SHARE * (time.monotonic() - began_s)
-
-
-async def test_what_comes_often_does_not_pass_through_mavsdk(
-    fake_autopilot: FakeAutopilot, cable: SerialCable, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    passed: set[str] = set()
-    receive = AutopilotLink._receive
-
-    def noted(link: AutopilotLink, message: MavlinkMessage, handle: object) -> None:
-        passed.add(message.message_name)
-        receive(link, message, handle)
-
-    monkeypatch.setattr(AutopilotLink, "_receive", noted)
-    async with attended(cable.address) as link:
-        await until(lambda: link.vehicle_state() is not None)
-        await until(lambda: "EXTENDED_SYS_STATE" in passed)
-        assert not passed & {layout.name for layout in LAYOUTS.values()}
 
 
 @pytest.mark.fault("serial-port")
