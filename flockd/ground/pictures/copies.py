@@ -75,7 +75,7 @@ def video_file(draft: Path, target: Path, rate_hz: float) -> Iterator[Callable[[
 
     OpenCV does not report a full disk: the index at the end of the file is then missing.
     """
-    video, written = cv2.VideoWriter(), 0
+    video, written = cv2.VideoWriter(), False
 
     def write(image: UInt8Array) -> None:
         nonlocal written
@@ -83,7 +83,7 @@ def video_file(draft: Path, target: Path, rate_hz: float) -> Iterator[Callable[[
         if not video.isOpened() and not video.open(str(draft), _CODEC, rate_hz, size):
             raise UsageError(f"{target}: cannot be written; name another place for it")
         video.write(cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
-        written += 1
+        written = True
 
     try:
         yield write

@@ -396,7 +396,7 @@ def watched(
     watcher = FleetWatcher("test", listen=[], connect=[telemetry], clock=clock)
     session = zenoh.open(client(telemetry))
     events: list[str] = []
-    session.declare_subscriber(
+    watcher._session.declare_subscriber(  # who has heard a state on it hears the next event; another may connect later
         "flockd/v1/test/tiny/events", lambda sample: events.append(json.loads(sample.payload.to_bytes())["event"])
     )
     try:

@@ -293,7 +293,7 @@ async def test_what_the_autopilot_refuses_is_in_status_word_for_word_and_once_in
     sentence = "the autopilot refuses to arm: a gyroscope is not calibrated; calibrate it in the ground station"
     with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S, clock=clock) as fake_autopilot:
         async with aboard(fake_autopilot, port, tmp_path) as ship:
-            await ship.ask("about")  # the session that receives events is connected
+            await ship.until_state("idle")
             fake_autopilot.failing = {"check_gyro_not_calibrated"}
             await ship.until_event(sentence)
             await until(lambda: ship.refusals() == {"check_gyro_not_calibrated"}, SECONDS_TO_FAIL)
