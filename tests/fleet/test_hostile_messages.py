@@ -70,23 +70,6 @@ def test_whatever_is_published_is_shown_or_left() -> None:
         check()
 
 
-class _Missions:
-    """Takes every order that it is given: what is wrong in itself is not to get here."""
-
-    def __init__(self) -> None:
-        self.orders: list[MissionOrder] = []
-
-    def fault(self, order: MissionOrder) -> None:
-        """None is refused."""
-        values = (order.place, order.place_deg, order.velocity, order.height_m, order.speed_m_s)
-        numbers = [np.atleast_1d(value) for value in values if value is not None]
-        assert np.isfinite(np.concatenate(numbers)).all(), f"{order} is not finite"
-
-    def apply(self, order: MissionOrder) -> None:
-        """Keeps it."""
-        self.orders.append(order)
-
-
 def test_a_changed_command_is_refused_or_carried_out_as_it_stands() -> None:
     loop = asyncio.new_event_loop()
     allowed = ("hold", "land", "goto", "velocity")
@@ -97,7 +80,7 @@ def test_a_changed_command_is_refused_or_carried_out_as_it_stands() -> None:
     @hostile(150)
     def check(random: Random) -> None:
         said: list[str] = []
-        requests, missions = OperatorRequests(), _Missions()
+        requests, orders_taken = OperatorRequests(), list[MissionOrder]()
         command = random.choice((*ABSURD_TEXTS, *NAMES, *COMMANDS, *allowed))
         if random.random() < 0.5:
             command = mutated_bytes(random, command.encode("utf-8", "replace")).decode("utf-8", "replace")
@@ -105,14 +88,16 @@ def test_a_changed_command_is_refused_or_carried_out_as_it_stands() -> None:
         if random.random() < 0.7:
             payload = mutated_bytes(random, payload)
         commands = OperatorCommands(
-            allowed, requests, missions, loop, said.append,
+            allowed, requests, loop, said.append, order_fault=lambda order: None, fly=orders_taken.append,
             state=lambda: State.NORMAL, identity="d", clock=lambda: 8.0,
         )  # fmt: skip
         reply = commands.handle(command, payload)
         loop.call_soon(loop.stop)
         loop.run_forever()
         assert command in allowed or not reply["accepted"]
-        assert len(missions.orders) == (reply["accepted"] and command in ("goto", "velocity"))
+        assert len(orders_taken) == (reply["accepted"] and command in ("goto", "velocity"))
+        for order in orders_taken:
+            assert np.isfinite(np.hstack([value for value in vars(order).values() if value is not None])).all(), order
         taken = command if reply["accepted"] else ""
         assert (requests.hold, requests.land, requests.resume) == (taken == "hold", taken == "land", False)
         for sentence in (*said, reply["sentence"]):

@@ -23,7 +23,6 @@ from flockd.core.data import data_path
 from flockd.core.messages import (
     SECTORS,
     FloatArray,
-    MissionOrder,
     MissionStatus,
     Neighbour,
     ObstacleRanges,
@@ -115,16 +114,10 @@ class MadeUpDrone:
         config = load_drone(data_path("config") / "simulator.yaml")
         about = AboutMessage(version=__version__, configuration=config.model_dump(mode="json"), commands=commands)
         self._commands = OperatorCommands(
-            commands, self._requests, self, loop, self._event, state=lambda: State.NORMAL, identity=telemetry.identity
-        )
+            commands, self._requests, loop, self._event, order_fault=lambda order: None, fly=lambda order: None,
+            state=lambda: State.NORMAL, identity=telemetry.identity,
+        )  # fmt: skip
         telemetry.announce(self.name, about, self._commands.handle, self._image)
-
-    def fault(self, order: MissionOrder) -> str | None:
-        """Takes every order, and flies none."""
-        return None
-
-    def apply(self, order: MissionOrder) -> None:
-        """See `fault`."""
 
     def step(self, time_s: float, places: FloatArray, velocity: FloatArray) -> None:
         """Publishes one step, of a flock that is at ``places`` (n, 2) and has one velocity (2,)."""

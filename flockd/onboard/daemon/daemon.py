@@ -14,6 +14,7 @@ from flockd.core.config import DroneConfig
 from flockd.core.errors import ConfigError, FlockdError
 from flockd.core.secrets import masked
 from flockd.flight.geometry import build_rig
+from flockd.flight.mission import order_fault
 from flockd.flight.perception import OneByOne
 from flockd.flight.safety import FLYING, Decision, Event, Gate, State
 from flockd.onboard.autopilot.autopilot_status import AutopilotError
@@ -28,7 +29,7 @@ from flockd.onboard.daemon.autopilot_tasks import (
 )
 from flockd.onboard.daemon.control import Control
 from flockd.onboard.daemon.message_sinks import MessageSinks
-from flockd.onboard.daemon.operator_orders import MissionOrders, OperatorCommands, OperatorRequests
+from flockd.onboard.daemon.operator_orders import OperatorCommands, OperatorRequests
 from flockd.onboard.daemon.pilot_loop import PilotLoop, VehicleHistory
 from flockd.onboard.daemon.status import Components, ServiceManager, notify_service_manager, publish_status
 from flockd.onboard.daemon.supervisor_inputs import InputCollector, LoopLag, Thermometer
@@ -150,10 +151,10 @@ class Daemon:
         control = Control(
             config, link, streamer, pilot_loop, collector, requests, history, self._operator, self._on_tick, clock
         )  # fmt: skip
-        missions = MissionOrders(config, pilot_loop, link.vehicle_state)
         loop = asyncio.get_running_loop()
         commands = OperatorCommands(
-            config.telemetry.commands, self._operator, missions, loop, sinks.event,
+            config.telemetry.commands, self._operator, loop, sinks.event,
+            order_fault=lambda order: order_fault(config, order, link.vehicle_state()), fly=pilot_loop.take_order,
             state=lambda: control.decision.state, identity=telemetry.identity,
         )  # fmt: skip
         previews = Previews(build_rig(config.rig), lambda: (pilot_loop.frames, pilot_loop.stepped))

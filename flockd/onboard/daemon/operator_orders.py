@@ -8,14 +8,11 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 from flockd.core import services
-from flockd.core.config import DroneConfig
-from flockd.core.messages import MissionOrder, VehicleState
-from flockd.flight.mission import order_fault
+from flockd.core.messages import MissionOrder
 from flockd.flight.safety import FLYING, State
-from flockd.onboard.daemon.pilot_loop import PilotLoop
 from flockd.onboard.telemetry.order_messages import parse_ask, parse_order
 from flockd.onboard.telemetry.topics import AnswerMessage, AskMessage, TakenOrderMessage
 
@@ -42,16 +39,6 @@ class OperatorRequests:
         self.resume = command == "resume"
 
 
-class Missions(Protocol):
-    """Receives operators' orders to the mission."""
-
-    def fault(self, order: MissionOrder) -> str | None:
-        """Why an order is refused, one sentence; None: it is accepted. On any thread."""
-
-    def apply(self, order: MissionOrder) -> None:
-        """Passes the order to the pilot's next step. On the event loop."""
-
-
 class OperatorCommands:
     """Accepts or refuses a command on any thread, and applies it on the event loop.
 
@@ -62,17 +49,20 @@ class OperatorCommands:
         self,
         allowed: Collection[str],
         requests: OperatorRequests,
-        missions: Missions,
         loop: asyncio.AbstractEventLoop,
         log_event: Callable[[str], None],
         *,
+        order_fault: Callable[[MissionOrder], str | None],
+        fly: Callable[[MissionOrder], None],
         state: Callable[[], State],
         identity: str,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """``state``: the supervisor's, on any thread; ``identity`` and ``clock``: those that the drone publishes."""
-        self._allowed, self._requests, self._missions, self._loop = allowed, requests, missions, loop
-        self._state = state
+        """``order_fault``: why the mission refuses an order, on any thread; ``fly``: passes one to the pilot's next
+        step, on the event loop; ``state``: the supervisor's, on any thread; ``identity`` and ``clock``: those that the
+        drone publishes."""
+        self._allowed, self._requests, self._loop = allowed, requests, loop
+        self._order_fault, self._fly, self._state = order_fault, fly, state
         self._checks = OrderChecks(identity, clock)
         self.recent = self._checks.recent
         self._taken = _Limited(log_event, burst=60, refill_s=1.0, clock=clock)
@@ -106,12 +96,12 @@ class OperatorCommands:
         fault = self._checks.fault(command, ask)
         if order is not None and fault is None:
             told = f"{_NOT_FLYING.format(state := self._state())}; its mission begins with the flight"
-            fault = self._missions.fault(order) if state in _TAKES_ORDERS else told
+            fault = self._order_fault(order) if state in _TAKES_ORDERS else told
         if fault is not None:
             raise ValueError(fault)
         self._checks.take(command, ask)
         if order is not None:
-            self._loop.call_soon_threadsafe(self._missions.apply, order)
+            self._loop.call_soon_threadsafe(self._fly, order)
         else:
             self._loop.call_soon_threadsafe(self._requests.apply, command)
 
@@ -209,19 +199,3 @@ class OrderChecks:
             for operator, command, sequence, age_s in taken
             if age_s <= RECENT_S
         ]
-
-
-class MissionOrders:
-    """Implements `Missions`."""
-
-    def __init__(self, config: DroneConfig, pilot_loop: PilotLoop, vehicle: Callable[[], VehicleState | None]) -> None:
-        """``vehicle``: the vehicle's newest state, on any thread."""
-        self._config, self._pilot_loop, self._vehicle = config, pilot_loop, vehicle
-
-    def fault(self, order: MissionOrder) -> str | None:
-        """Why an order is refused, one sentence; None: it is accepted. On any thread."""
-        return order_fault(self._config, order, self._vehicle())
-
-    def apply(self, order: MissionOrder) -> None:
-        """Passes the order to the pilot's next step. On the event loop."""
-        self._pilot_loop.order = order

@@ -116,6 +116,10 @@ class PilotLoop:
         self._pilot = self.order = None
         self._reports.begin()
 
+    def take_order(self, order: MissionOrder) -> None:
+        """Passes an operator's order to the next step."""
+        self.order = order
+
     @property
     def ego_motion_age_s(self) -> float:
         """Time without own motion, as of the newest step."""

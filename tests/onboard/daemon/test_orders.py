@@ -28,15 +28,9 @@ class Drone:
         self.goals: list[MissionOrder] = []
         self.requests, self.loop = OperatorRequests(), asyncio.new_event_loop()
         self.commands = OperatorCommands(
-            ALLOWED, self.requests, self, self.loop, self.said.append,
+            ALLOWED, self.requests, self.loop, self.said.append, order_fault=lambda order: None, fly=self.goals.append,
             state=lambda: self.state, identity="1f", clock=lambda: self.now_s,
         )  # fmt: skip
-
-    def fault(self, order: MissionOrder) -> None:
-        """None is refused."""
-
-    def apply(self, order: MissionOrder) -> None:
-        self.goals.append(order)
 
     def order(self, command: str, sequence: int, **more: Any) -> AnswerMessage:
         """An order of anna's, given now."""

@@ -204,11 +204,10 @@ def test_two_drones_of_one_name_are_told_apart_by_identity_and_neither_gets_an_o
     endpoint, asked = free_endpoint(), list[str]()
 
     def commands(telemetry: ZenohTelemetry, loop: asyncio.AbstractEventLoop) -> None:
-        requests, missions = OperatorRequests(), cast("Any", None)
-        identity = telemetry.identity
         handler = OperatorCommands(
-            ["hold"], requests, missions, loop, asked.append, state=lambda: State.NORMAL, identity=identity
-        )
+            ["hold"], OperatorRequests(), loop, asked.append, order_fault=str, fly=print, state=lambda: State.NORMAL,
+            identity=telemetry.identity,
+        )  # fmt: skip
         about = AboutMessage(version="1", configuration={}, commands=["hold"])
         telemetry.announce("d", about, handler.handle, lambda camera: None)
 
