@@ -98,15 +98,6 @@ def test_known_values_are_not_counted() -> None:
     assert log == []
 
 
-def test_a_home_that_moves_counts_on_the_ground_only_and_with_an_unknown_landed_state_never_raises() -> None:
-    home = [("HOME_POSITION", {"x": 0.0, "y": 0.0, "z": float(down)}) for down in (-1, -2, -3)]
-    landed = [("EXTENDED_SYS_STATE", {"landed_state": value}) for value in (2, 5)]
-    received, _ = _received(home[0], landed[0], home[1])
-    assert received.home_down_m == -1.0
-    received, _ = _received(home[0], landed[1], home[2])
-    assert received.home_down_m == -3.0
-
-
 def test_an_unknown_result_of_a_command_has_words_too() -> None:
     assert result_text(4) == "failed"
     assert "200" in result_text(200)

@@ -393,22 +393,6 @@ def test_the_supervisor_is_told_of_an_obstacle_where_hold_needs_room() -> None:
     assert [inputs.obstacle_near for inputs in told] == [True, False, False]
 
 
-@pytest.mark.parametrize("landed", ["ground", "landing", "unknown"])
-def test_an_operators_order_ends_when_the_autopilot_is_disarmed(landed: Any) -> None:
-    """Whatever is known of the ground by then: the heartbeat may come before it."""
-    config, operator = _flyable("front"), OperatorRequests(hold=True, land=True)
-    parts: Any = SimpleNamespace(
-        newest=None, noisy_images=Counter(), ego_motion_age_s=0.0, neighbour_seen_s=0.0, load=lambda: 0.5, faults=0,
-        stuck=False, worst_s=lambda: 0.0, hottest_c=None, status=dict,
-    )  # fmt: skip
-    collector = InputCollector(config, parts, parts, parts, Gate(config.safety.gate), parts, parts, {}, lambda: 0.0)
-    asked = []
-    for status in (autopilot_status(armed=True), autopilot_status(armed=False, landed_state=landed)):
-        inputs = collector.collect(status, None, operator, None, None, math.inf)
-        asked.append((inputs.hold_asked, inputs.land_asked))
-    assert asked == [(True, True), (False, False)]
-
-
 async def test_a_disk_that_takes_its_time_to_end_a_recording_delays_no_telemetry(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

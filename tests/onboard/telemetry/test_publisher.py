@@ -152,15 +152,6 @@ def test_a_taken_port_is_reported_in_one_sentence() -> None:
     assert f"{endpoint} ({reason}); " in str(caught.value)
 
 
-def test_a_stream_is_stale_after_it_missed_two_messages() -> None:
-    for topic in TOPICS.values():
-        if topic.rate_hz is None:
-            assert topic.stale_after_s is None
-        else:
-            assert topic.stale_after_s is not None
-            assert topic.stale_after_s * topic.rate_hz >= 3.0
-
-
 @pytest.mark.parametrize("endpoint", ["drone1:7447", "tcp/10.0.0.11", "tcp/127.0.0.1:70000", "http://drone1:7447"])
 def test_what_is_no_endpoint_is_refused_with_what_to_write(endpoint: str) -> None:
     with pytest.raises(UnavailableError, match=f"a page: {endpoint} is not a zenoh endpoint; write protocol, address"):
