@@ -118,9 +118,7 @@ def test_a_plan_is_its_own_copy(tmp_path: Path) -> None:
             "6: vary.duration_s: `low`, `high` and `steps` are",
         ),
         ("measure: [min_distance]\n", "5: measure[0]: min_distance is not known; did you mean `min_distance_m`?"),
-        ("stop: {figure: order_tail, half_width: 1}\n", "5: stop: is gone; "),
         ("fixed: {seed: 3}\n", "5: fixed.seed: is set for each flight"),
-        ("errors: shipped_networks.yaml\n", "5: errors: is gone; "),
         ("perception: control\n", "5: perception: "),
     ],
 )
