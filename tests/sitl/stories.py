@@ -11,7 +11,7 @@ import socket
 import tempfile
 import threading
 import time
-from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterator
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,10 +24,9 @@ from flockd.core.errors import UnavailableError
 from flockd.core.messages import FloatArray, Setpoint, Wanted
 from flockd.flight.safety import Action, Permission, Request, Verdict
 from flockd.onboard.autopilot.autopilot_status import AutopilotError
-from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
+from flockd.onboard.autopilot.mavsdk_link import AutopilotLink, Severity
 from flockd.onboard.autopilot.streamer import SetpointStreamer
-from flockd.onboard.simulated_time import clock_at
-from flockd.sim.sitl.autopilots import BY_HAND, Autopilots, Px4s, SimulatedAutopilots
+from flockd.sim.sitl.autopilots import Autopilots, Px4s, SimulatedAutopilots
 from flockd.sim.sitl.processes import free_port
 from tests.make import around
 from tests.onboard.autopilot.pilots_link import PilotsLink
@@ -37,10 +36,9 @@ HEIGHT_M = 4.0
 NORTH_M_S = 1.0
 START_S = 60.0
 STEP_S, POLL_S = 30.0, 0.01
-STICK_S, STICK_STEP = 0.03, 100
-"""Between two positions of a remote control's sticks, and how far of 1000 they move in that time: fast."""
-REMOTE_CONTROL = {**BY_HAND, "MPC_VEL_MANUAL": "3", "COM_RC_LOSS_T": "5"}
-"""PX4's parameters where one is used; the last for a computer that is slow to send its sticks."""
+GROUND_STATION_PORT = 14550
+"""Where PX4's instance 0 looks for one."""
+TEXT = "flockd hover: no camera has sent a usable frame for 1.2 s; 2 more reasons"
 HEARTBEAT, EVENT = 0, 410
 
 
@@ -116,17 +114,13 @@ class World:
     station: Meddler
     relay: Relay
     restart: Callable[[], None]
-    speed_factor: float
     clock: Callable[[], float]
-    """Simulated seconds."""
-    stick: int = 0
-    """Where a pilot moves the remote control's stick: forward, of 1000."""
     rows: list[Row] = field(default_factory=list)
     reports: list[str] = field(default_factory=list)
     """All that the link has reported."""
 
     async def until(self, condition: Callable[[], bool], what: str, timeout_s: float = STEP_S) -> float:
-        """Simulated seconds until it holds. Raises UnavailableError when it does not in time."""
+        """Seconds until it holds. Raises UnavailableError when it does not in time."""
         begun = self.clock()
         while not condition():
             if self.clock() - begun > timeout_s:
@@ -309,6 +303,15 @@ async def _stream(station: Meddler) -> None:
         await asyncio.sleep(0.05)
 
 
+async def text(world: World) -> None:
+    """PX4 forwards it to a ground station's link; the fake has one link for all."""
+    with Meddler([GROUND_STATION_PORT], world.clock) as ground:
+        await world.until(lambda: bool(ground.mode(0)) or world.station.is_connected(0), "a heartbeat")
+        await asyncio.sleep(1.5)  # the autopilot has heard the ground station's heartbeat
+        world.link.send_text(TEXT, Severity.WARNING)
+        await world.saw("text", lambda: TEXT in {ground.last_text(0), world.station.last_text(0)}, "it is whole")
+
+
 async def landing(world: World) -> None:
     """The end."""
     link = world.link
@@ -335,7 +338,7 @@ def _rate(world: World) -> bool:
 
 
 Story = Callable[[World], Awaitable[None]]
-CONTRACT: tuple[Story, ...] = (on_the_ground, take_off, in_flight, others_interfere, landing, starting_anew)
+CONTRACT: tuple[Story, ...] = (on_the_ground, take_off, in_flight, others_interfere, text, landing, starting_anew)
 
 
 def _pass(now_s: float, request: Request) -> Verdict:
@@ -359,15 +362,6 @@ async def _offer(world: World) -> None:
         await asyncio.sleep(0.05)
 
 
-async def _move_stick(world: World) -> None:
-    """As a remote control sends it, for ever: towards where the pilot wants it."""
-    stick = 0
-    while True:
-        stick += max(-STICK_STEP, min(STICK_STEP, world.stick - stick))
-        world.station.push_sticks(0, forward=stick)
-        await asyncio.sleep(STICK_S)
-
-
 async def _ask(link: AutopilotLink) -> None:
     """For its checks, as the daemon does while it does not know them."""
     while True:
@@ -377,19 +371,19 @@ async def _ask(link: AutopilotLink) -> None:
         await asyncio.sleep(1.0)
 
 
-Make = Callable[[float, Mapping[str, str], ExitStack], tuple[Autopilots, Callable[[], None]]]
-"""An autopilot at a speed factor with PX4's parameters, and what starts it anew."""
+Make = Callable[[ExitStack], tuple[Autopilots, Callable[[], None]]]
+"""An autopilot, and what starts it anew."""
 
 
-def _fake(speed_factor: float, _: Mapping[str, str], stack: ExitStack) -> tuple[Autopilots, Callable[[], None]]:
-    fakes = SimulatedAutopilots(one_drone(HEIGHT_M), speed_factor, lambda north, _: np.zeros_like(north))
+def _fake(stack: ExitStack) -> tuple[Autopilots, Callable[[], None]]:
+    fakes = SimulatedAutopilots(one_drone(HEIGHT_M), 1.0, lambda north, _: np.zeros_like(north))
     return stack.enter_context(fakes), lambda: fakes.fakes[0].restart()  # noqa: PLW0108 - there is none before it starts
 
 
-def _px4(speed_factor: float, parameters: Mapping[str, str], stack: ExitStack) -> tuple[Autopilots, Callable[[], None]]:
+def _px4(stack: ExitStack) -> tuple[Autopilots, Callable[[], None]]:
     folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="contract-")))
     first, again = (
-        stack.enter_context(Px4s(one_drone(HEIGHT_M), speed_factor, os.environ, folder / name, parameters))
+        stack.enter_context(Px4s(one_drone(HEIGHT_M), 1.0, os.environ, folder / name, {}))
         for name in ("first", "again")
     )
 
@@ -400,10 +394,10 @@ def _px4(speed_factor: float, parameters: Mapping[str, str], stack: ExitStack) -
     return first, restart
 
 
-async def _fly(told: Sequence[Story], make: Make, speed_factor: float, *, remote_control: bool) -> list[Row]:
-    clock = clock_at(speed_factor)
+async def _fly(make: Make) -> list[Row]:
+    clock = time.monotonic
     with ExitStack() as stack:
-        autopilots, restart = make(speed_factor, REMOTE_CONTROL if remote_control else {}, stack)
+        autopilots, restart = make(stack)
         ports, flockd_port = autopilots.ports[0], free_port()
         relay = stack.enter_context(Relay(ports.offboard, flockd_port))
         station = stack.enter_context(Meddler([ports.truth], clock))
@@ -418,11 +412,11 @@ async def _fly(told: Sequence[Story], make: Make, speed_factor: float, *, remote
         link = await PilotsLink.connect(parameters, timeout_s=START_S, clock=clock)
         streamer = SetpointStreamer(link.send_setpoint, link.status, _pass, parameters, SafetyParameters(), clock=clock)
         streamer.start()
-        world = World(link, streamer, station, relay, restart, speed_factor, clock)
+        world = World(link, streamer, station, relay, restart, clock)
         runs = [link.attend(), link.synchronise(), _offer(world), _ask(link)]
-        tasks = [asyncio.create_task(run) for run in (*runs, *([_move_stick(world)] if remote_control else []))]
+        tasks = [asyncio.create_task(run) for run in runs]
         try:
-            for story in told:
+            for story in CONTRACT:
                 try:
                     await story(world)
                 except (UnavailableError, AutopilotError) as error:
@@ -435,12 +429,9 @@ async def _fly(told: Sequence[Story], make: Make, speed_factor: float, *, remote
             await link.close()
 
 
-def seen(
-    autopilot: str, told: Sequence[Story] = CONTRACT, speed_factor: float = 1.0, *, remote_control: bool = False
-) -> list[Row]:
-    """What flockd sees of one of them; `remote_control`: a pilot holds one. Raises UnavailableError."""
-    make = {"fake": _fake, "px4": _px4}[autopilot]
-    rows = asyncio.run(_fly(told, make, speed_factor, remote_control=remote_control))
+def seen(autopilot: str) -> list[Row]:
+    """What flockd sees of one of them. Raises UnavailableError."""
+    rows = asyncio.run(_fly({"fake": _fake, "px4": _px4}[autopilot]))
     for row in rows:
         print(f"{row.story:32}{row.what}" + ("" if row.after_s is None else f", after {row.after_s:.1f} s"))  # noqa: T201
     return rows

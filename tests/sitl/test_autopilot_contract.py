@@ -44,6 +44,7 @@ SEEN = (
     ("COM_OF_LOSS_T 1", "over"),
     ("NAV_DLL_ACT 2", "flockd does not announce itself any more"),
     ("NAV_DLL_ACT 0", "it does again"),
+    ("text", "it is whole"),
     ("land", "accepted"),
     ("land", "the mode is land"),
     ("land", "disarmed on the ground, in mode hold"),

@@ -31,10 +31,6 @@ class SettingsError(FlockdError):
 class SessionError(UnavailableError):
     """Endpoints are not usable."""
 
-    def __init__(self, purpose: str, endpoints: str, reason: str) -> None:
-        super().__init__(f"{purpose} cannot use {endpoints} ({reason}); name another endpoint")
-        self.reason = reason
-
 
 def open_session(
     purpose: str,
@@ -95,7 +91,8 @@ def open_session(
     except zenoh.ZError as error:
         endpoints = ", ".join([*listen, *connect]) or "no endpoint"
         with_settings = f" with the settings of {settings}" if settings else ""
-        raise SessionError(purpose, f"{endpoints}{with_settings}", _reason(error)) from error
+        told = f"{purpose} cannot use {endpoints}{with_settings} ({_reason(error)}); name another endpoint"
+        raise SessionError(told) from error
 
 
 def read_settings(file: Path) -> zenoh.Config:

@@ -206,6 +206,26 @@ def test_an_image_that_claims_to_be_huge_is_not_decoded(tmp_path: Path, whole: P
         list(Recording(rewritten(whole, tmp_path / "x.mcap", huge)).steps())
 
 
+@pytest.mark.fault("hostile-recording")
+@pytest.mark.parametrize("topic", ["/vehicle", "/output"])
+@pytest.mark.parametrize(
+    "data", [b"", b"{", b"\xff", b"[1]", b"[" * 100_000], ids=["none", "open", "utf8", "list", "deep"]
+)
+def test_a_step_with_a_damaged_message_is_named(tmp_path: Path, whole: Path, topic: str, data: bytes) -> None:
+    """Behind a checksum that is right."""
+
+    def damaged(one: Record) -> Record:
+        hit = isinstance(one, Entry) and one.stream.topic == topic and one.sequence == 1
+        return replace(one, data=data) if hit else one  # type: ignore[arg-type]
+
+    recording = Recording(rewritten(whole, tmp_path / "x.mcap", damaged))
+    if (topic, data) == ("/output", b"[1]"):  # an output is only compared, not flown
+        assert len(list(recording.steps())) == 10
+        return
+    with pytest.raises(RecordingError, match="step 1 cannot be read "):
+        list(recording.steps())
+
+
 @pytest.mark.parametrize("number", ["NaN", "-1", "1e9", "9" * 5000, ""])
 def test_a_number_of_lost_steps_that_is_none_is_refused(tmp_path: Path, whole: Path, number: str) -> None:
     assert "which is no number" in refusal(with_facts(whole, tmp_path / "x.mcap", lost=number))
