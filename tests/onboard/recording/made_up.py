@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -111,18 +111,23 @@ def with_facts(source: Path, target: Path, **facts: str) -> Path:
 
 def record(
     path: Path,
-    steps: int = 10,
+    flown: int | Iterable[tuple[FrameSet, VehicleState]] = 10,
     settings: RecordingConfig | None = None,
     learned: LearnedSize | None = LEARNED,
+    told: list[str] | None = None,
 ) -> list[PilotOutput]:
-    """Records a made-up flight, and gives what its pilot said."""
-    config = drone_config()
+    """Records a made-up flight, of so many steps or of these inputs, and gives what its pilot said.
+
+    ``told`` gets the recorder's events; without it, the recording has to be whole.
+    """
+    config, outputs, events = drone_config(), list[PilotOutput](), list[str]() if told is None else told
     pilot = MadeUpPilot(config, learned=learned)
-    outputs = []
-    with Recorder(path, drone="drone1", config=config, settings=settings, models=MODELS, learned=learned) as recorder:
-        for frames, vehicle in inputs(steps):
+    with Recorder(
+        path, drone="drone1", config=config, settings=settings, models=MODELS, learned=learned, on_event=events.append
+    ) as recorder:
+        for frames, vehicle in inputs(flown) if isinstance(flown, int) else flown:
             outputs.append(pilot.step(frames, vehicle))
             recorder.drain()
             recorder.step(frames, vehicle, outputs[-1])
-    assert recorder.failure is None
+    assert told is not None or recorder.failure is None
     return outputs

@@ -35,10 +35,10 @@ def _recorded(folder: Path, name: str, size_bytes: int, number: int, *, drone: s
 def test_as_a_flight_grows_the_oldest_go_and_no_more_than_have_to(tmp_path: Path) -> None:
     """1 MB in all; the flight before this one neither counts nor goes."""
     files = [_recorded(tmp_path, f"flight{k}", 300_000, k) for k in (1, 2, 3, 4)]
-    record(tmp_path / "now.mcap", steps=1, settings=SETTINGS)
+    record(tmp_path / "now.mcap", 1, SETTINGS)
     assert [file.exists() for file in files] == [False, True, True, True]
     (tmp_path / "now.mcap").unlink()
-    record(tmp_path / "now.mcap", steps=6, settings=SETTINGS)
+    record(tmp_path / "now.mcap", 6, SETTINGS)
     assert [file.exists() for file in files] == [False, False, False, True]
 
 
@@ -56,7 +56,7 @@ def test_on_a_full_disk_the_oldest_go_and_the_flight_before_last(
     left = []
     for steps in (1, 3, 6):
         (tmp_path / "now.mcap").unlink(missing_ok=True)
-        record(tmp_path / "now.mcap", steps=steps)
+        record(tmp_path / "now.mcap", steps)
         left.append([file.exists() for file in files])
     assert left == [[True, True], [False, True], [False, False]]
     assert len(list(Recording(tmp_path / "now.mcap").steps())) == 6
@@ -67,17 +67,14 @@ def test_what_is_not_this_drones_flight_neither_counts_nor_goes(tmp_path: Path, 
     others = [_recorded(tmp_path, f"other{k}", 900_000, k, drone="drone2") for k in (1, 2)]
     replayed = _recorded(tmp_path, "replayed", 900_000, 3, **{made_of_another: "x.mcap"})
     own = _recorded(tmp_path, "own", 500_000, 4)
-    record(tmp_path / "now.mcap", steps=1, settings=SETTINGS)
+    record(tmp_path / "now.mcap", 1, SETTINGS)
     assert all(file.exists() for file in (*others, replayed, own))
 
 
 def test_a_flight_that_fills_the_quota_alone_is_recorded_so_far(tmp_path: Path) -> None:
     told: list[str] = []
-    path, config = tmp_path / "now.mcap", drone_config()
-    with Recorder(path, drone="drone1", config=config, settings=SETTINGS, on_event=told.append) as recorder:
-        for frames, vehicle in inputs(40):
-            recorder.drain()
-            recorder.step(frames, vehicle, output(frames.time_s))
+    path = tmp_path / "now.mcap"
+    record(path, 40, SETTINGS, told=told)
     assert told == [f"recording {path}: recording.quota_mb is reached; the recording ends here and the flight goes on"]
     assert 1e6 < path.stat().st_size < 5e6
     assert not Recording(path).contents.finished

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import os
 import resource
 import subprocess
@@ -100,27 +99,20 @@ def test_steps_come_back_with_every_pixel_and_every_bit(path: Path) -> None:
 
 
 def test_jpeg_is_smaller_and_near(tmp_path: Path) -> None:
-    config = drone_config()
     smooth = np.repeat(np.linspace(0, 255, 160).astype(np.uint8)[None, :, None], 120, 0).repeat(3, 2)
-    with Recorder(
-        tmp_path / "drone1.mcap", drone="drone1", config=config, settings=RecordingConfig(images="jpeg")
-    ) as recorder:
-        (frames, vehicle) = next(inputs(1))
-        object.__setattr__(frames.frames["left"], "image", smooth)
-        recorder.step(frames, vehicle, MadeUpPilot(config).step(frames, vehicle))
+    frames, vehicle = next(inputs(1))
+    object.__setattr__(frames.frames["left"], "image", smooth)
+    record(tmp_path / "drone1.mcap", [(frames, vehicle)], RecordingConfig(images="jpeg"))
     (step,) = Recording(tmp_path / "drone1.mcap").steps()
     assert cv2.PSNR(step.frames.frames["left"].image, smooth) > 40.0
     assert not np.array_equal(step.frames.frames["front"].image, frames.frames["front"].image)
 
 
 def test_a_frame_that_is_no_image_is_left_out_and_reported(tmp_path: Path) -> None:
-    config = drone_config()
     told: list[str] = []
-    with Recorder(tmp_path / "drone1.mcap", drone="drone1", config=config, on_event=told.append) as recorder:
-        frames, vehicle = next(inputs(1))
-        output = MadeUpPilot(config).step(frames, vehicle)
-        object.__setattr__(frames.frames["left"], "image", np.zeros((0, 0, 3), np.uint8))
-        recorder.step(frames, vehicle, output)
+    frames, vehicle = next(inputs(1))
+    object.__setattr__(frames.frames["left"], "image", np.zeros((0, 0, 3), np.uint8))
+    record(tmp_path / "drone1.mcap", [(frames, vehicle)], told=told)
     (step,) = Recording(tmp_path / "drone1.mcap").steps()
     assert set(step.frames.frames) == {"front"}
     assert len(told) == 1 and "camera left" in told[0]
@@ -134,10 +126,7 @@ def test_what_is_no_readable_file_in_the_folder_is_skipped_with_a_warning(tmp_pa
     os.mkfifo(tmp_path / "pipe.mcap")
     (tmp_path / "damaged.mcap").write_bytes(b"\x89MCAP0\r\n" + b"\xff" * 100)
     odd, told = sorted(path.name for path in tmp_path.iterdir()), list[str]()
-    config = drone_config()
-    with Recorder(tmp_path / "drone1.mcap", drone="drone1", config=config, on_event=told.append) as recorder:
-        frames, vehicle = next(inputs(1))
-        recorder.step(frames, vehicle, MadeUpPilot(config).step(frames, vehicle))
+    record(tmp_path / "drone1.mcap", 1, told=told)
     assert len(list(Recording(tmp_path / "drone1.mcap").steps())) == 1
     for name in odd:
         assert sum(name in text and "skipped" in text for text in told) == 1, name
@@ -171,14 +160,11 @@ def test_a_disk_that_never_answers_costs_steps_but_no_time(tmp_path: Path, monke
 def test_two_recordings_that_begin_in_one_microsecond_are_both_kept(tmp_path: Path) -> None:
     """As of two boots without a clock: the name is of the time."""
     path, told = tmp_path / "drone1-19700101T000012000000Z.mcap", list[str]()
-    outputs, config = record(path, 3), drone_config()
+    record(path, 4)
     for number in (2, 3):
-        with Recorder(path, drone="drone1", config=config, models=MODELS, on_event=told.append) as recorder:
-            for frames, vehicle in inputs(number):
-                recorder.step(frames, vehicle, MadeUpPilot(config).step(frames, vehicle))
-        assert recorder.path == tmp_path / f"drone1-19700101T000012000000Z-{number}.mcap"
-        assert len(list(Recording(recorder.path).steps())) == number
-    assert len(list(Recording(path).steps())) == len(outputs)
+        record(path, number, told=told)
+        assert len(list(Recording(path.with_stem(f"{path.stem}-{number}")).steps())) == number
+    assert len(list(Recording(path).steps())) == 4
     assert [text for text in told if "exists, so that the recording is" in text] == told != []
 
 
@@ -231,10 +217,6 @@ def test_a_full_disk_ends_the_recording_and_not_the_flight(tmp_path: Path, kind:
 
 def test_nowhere_to_write_is_reported_once_and_does_not_raise(tmp_path: Path) -> None:
     told: list[str] = []
-    config = drone_config()
     path = tmp_path / "missing" / "drone1.mcap"
-    with Recorder(path, drone="drone1", config=config, on_event=told.append) as recorder:
-        for frames, vehicle in itertools.islice(inputs(3), 3):
-            recorder.step(frames, vehicle, MadeUpPilot(config).step(frames, vehicle))
-            recorder.drain()
+    record(path, 3, told=told)
     assert len(told) == 1 and told[0].startswith(f"recording {path}: no such file or directory; ")

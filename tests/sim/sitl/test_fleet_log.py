@@ -16,7 +16,7 @@ from tests.onboard.recording.made_up import drone_config, record
 def test_a_motion_over_a_skipped_frame_set_is_not_in_the_log(tmp_path: Path) -> None:
     """Four frame sets were processed and one between them was not: of the motion that spans it there is no truth."""
     config = drone_config()
-    outputs = record(tmp_path / f"{config.name}-1.mcap", steps=4)
+    outputs = record(tmp_path / f"{config.name}-1.mcap", flown=4)
     times = [outputs[0].time_s, outputs[1].time_s, outputs[1].time_s + 0.05, outputs[2].time_s, outputs[3].time_s]
     frames = tuple(
         Poses(time_s, np.full((1, 3), float(row)), np.eye(3)[None], np.ones((1, 3))) for row, time_s in enumerate(times)
