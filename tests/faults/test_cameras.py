@@ -126,8 +126,7 @@ async def test_the_camera_ahead_is_gone_for_good(in_flight: InTheAir, reacted: R
 
 
 @pytest.mark.fault("time-stamps-jump", within_s=4.0)
-@pytest.mark.parametrize("ahead_s", [3.0, 86_400.0, -86_400.0, 1e300], ids=["3 s", "a day", "a day ago", "absurd"])
-async def test_a_frame_of_another_time_silences_nobody(ahead_s: float, in_flight: InTheAir, reacted: Reacted) -> None:
+async def test_a_frame_of_another_time_silences_nobody(in_flight: InTheAir, reacted: Reacted) -> None:
     """Three frames of one camera; all good ones after it are used at once."""
     spoiled: list[float] = []
 
@@ -135,7 +134,7 @@ async def test_a_frame_of_another_time_silences_nobody(ahead_s: float, in_flight
         if frame.camera != "front" or len(spoiled) >= 3:
             return frame
         spoiled.append(clock())
-        return replace(frame, time_s=frame.time_s + ahead_s)
+        return replace(frame, time_s=frame.time_s + 3.0)
 
     async with in_flight() as ship:
         steps = ship.heard()["computer"].message["steps"]

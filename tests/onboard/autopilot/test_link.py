@@ -96,18 +96,6 @@ async def test_firmware_and_failsafe_parameters_can_be_read(address: str, fake_a
     await link.close()
 
 
-async def test_offboard_without_setpoints_is_refused_and_the_reason_told(
-    address: str, fake_autopilot: FakeAutopilot
-) -> None:
-    async with attended(address) as link:
-        await link.ask_for_checks()
-        await until(link.knows_checks)
-        refused = r"asked for offboard, which was refused for now: it receives no setpoints, as flockd sends none yet; "
-        with pytest.raises(AutopilotError, match=refused):
-            await link.request_offboard()
-        assert fake_autopilot.mode == "LOITER"
-
-
 @pytest.mark.fault("silent-autopilot")
 async def test_an_autopilot_that_acts_on_the_loss_of_its_ground_station_hears_none_and_sends_no_texts(
     address: str, fake_autopilot: FakeAutopilot
@@ -218,20 +206,6 @@ async def test_a_setpoint_that_is_not_finite_never_leaves(address: str, fake_aut
     assert not fake_autopilot.setpoints
     assert fake_autopilot.refused_setpoints == 0
     await link.close()
-
-
-async def test_arming_taking_off_and_landing_from_offboard(port: int, address: str) -> None:
-    with FakeAutopilot(port, heartbeat_s=HEARTBEAT_S, clock=clock) as fake_autopilot:
-        async with flying(address) as flight:
-            assert not flight.link.status().armed
-            await flight.link.arm()
-            await flight.link.take_off()
-            await until(lambda: fake_autopilot.mode == "LOITER" and fake_autopilot.state.position[2] < -2.3)
-            await until(lambda: flight.link.status().armed and flight.link.status().in_air)
-            await flight.enter_offboard()
-            await flight.link.land()
-            await until(lambda: fake_autopilot.mode == "LAND")
-            await until(lambda: "left offboard" in (flight.streamer.report().silence or ""))
 
 
 def test_nobody_there_is_told_with_what_to_check(address: str) -> None:

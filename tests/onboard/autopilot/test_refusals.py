@@ -7,12 +7,8 @@ from typing import Any
 
 import pytest
 
-from flockd.onboard.autopilot.autopilot_status import AutopilotError
 from flockd.onboard.autopilot.mavlink_messages import ReceivedMessages
 from flockd.onboard.autopilot.refusal_reasons import CHECKS_FAIL, NAMES, REASONS, event_number
-from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
-from tests.calm import clock
-from tests.onboard.autopilot.flight import attended, flying, until
 
 HOLD, POSITION, LAND, OFFBOARD = (4 << 16 | 3 << 24), 3 << 16, (4 << 16 | 6 << 24), 6 << 16
 ARMED = 128
@@ -198,42 +194,3 @@ def test_another_onboard_computer_is_a_reason_while_it_is_heard() -> None:
     assert story.sentences()[0].startswith("the autopilot: another onboard computer is on its link")
     story.now_s += 6.0
     assert story.sentences() == []
-
-
-REFUSING = [
-    "check_estimator_missing_data",
-    "check_system_no_home_pos",
-    "check_man_control_kill_engaged",
-    "check_rc_dl_no_dllink",
-    "check_gf_violation_max_hor_dist",
-    "check_battery_critical",
-    "check_gyro_not_calibrated",
-    "check_mag_sys_has_mag_missing",
-    "check_avionics_power_low",
-    "check_cpuload_too_high",
-    "check_parachute_missing",
-    "check_system_safety_button",
-]
-
-
-async def test_twelve_refusals_of_the_fake_autopilot_one_by_one_through_mavsdk(port: int) -> None:
-    with FakeAutopilot(port, clock=clock) as fake_autopilot:
-        async with attended(f"udpin://127.0.0.1:{port}") as link:
-            await link.ask_for_checks()
-            await until(lambda: link.knows_checks() and fake_autopilot.has_ground_station)
-            for name in REFUSING:
-                fake_autopilot.failing = {name}
-                await until(lambda name=name: [r.reason for r in link.refusals()] == [name])  # type: ignore[misc]
-            with pytest.raises(AutopilotError) as refused:
-                await link.arm()
-            assert "Arming denied: Resolve system health failures first; its safety button was" in str(refused.value)
-            fake_autopilot.failing = set()
-            await until(lambda: not link.refusals())
-            await link.arm()
-
-
-async def test_offboard_that_is_possible_is_not_refused_by_anything(port: int, fake_autopilot: FakeAutopilot) -> None:
-    async with flying(f"udpin://127.0.0.1:{port}") as flight:
-        await flight.enter_offboard()
-        assert flight.link.refusals() == ()
-    assert fake_autopilot.armed

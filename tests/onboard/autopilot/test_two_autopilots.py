@@ -60,14 +60,12 @@ async def test_a_second_one_that_comes_later_is_told_and_ends_it(
 
 
 @pytest.mark.fault("serial-port")
-@pytest.mark.parametrize("system_id", [1, None])
 @pytest.mark.parametrize("clocks_agree", [False, True])
 async def test_one_of_the_same_id_is_told_by_its_clock_or_its_board_once_and_ends_it(
-    port: int, address: str, fake_autopilot: FakeAutopilot, system_id: int | None, clocks_agree: bool,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+    port: int, address: str, fake_autopilot: FakeAutopilot, clocks_agree: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(mavsdk_link, "VERSION_AGAIN_S", 0.5)
-    async with attended(address, system_id=system_id) as link:
+    async with attended(address) as link:
         await until(lambda: link.vehicle_state() is not None)
         await asyncio.sleep(1.0)
         assert link.unusable() is None
