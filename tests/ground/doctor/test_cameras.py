@@ -183,7 +183,7 @@ def test_a_driver_that_hangs_is_reported_and_the_other_camera_is_seen() -> None:
 
 
 def test_a_pipeline_is_watched_as_a_device_is() -> None:
-    fake = (sys.executable, "-IS", str(Path(__file__).parents[2] / "onboard" / "sources" / "fake_pipeline.py"))
+    fake = (sys.executable, "-IS", str(Path(__file__).parents[2] / "onboard" / "sources" / "fake_child.py"))
     names = {"front": "caps:64x48 500 stall", "back": "fail:has_failed_(no_such_sensor)"}
     cameras = tuple(CameraDeviceParameters(name=n, pipeline=text, rate_hz=40.0) for n, text in names.items())
     source = SourceParameters(kind="gstreamer", cameras=cameras)

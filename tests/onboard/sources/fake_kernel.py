@@ -88,6 +88,96 @@ class FakeCamera:
     failing: int = 0
     """The error number of every DQBUF; 0: none."""
 
+    # Its driver, a method for each request.
+
+    def querycap(self, memory: memoryview) -> None:
+        of_all_devices = 0x80000000 | VIDEO_CAPTURE | METADATA_CAPTURE | STREAMING
+        struct.pack_into("<32s", memory, 16, self.card)
+        struct.pack_into("<III", memory, 80, 6 << 16, of_all_devices, self.capabilities)
+
+    def s_fmt(self, memory: memoryview) -> None:
+        width, height, code = struct.unpack_from("<II4s", memory, 8)
+        self.settings.append(("format", (width, height, code)))
+        if (width, height, code) not in self.formats:
+            width, height, code = self.formats[0]
+        row = 0 if code == b"MJPG" else 2 * width + self.padding
+        struct.pack_into("<II4sIII", memory, 8, width, height, code, 1, row, BUFFER_LENGTH)
+
+    def s_parm(self, memory: memoryview) -> None:
+        numerator, denominator = struct.unpack_from("<II", memory, 12)
+        self.settings.append(("rate", denominator / numerator))
+        rate = min(self.rates, key=lambda rate: abs(rate - denominator / numerator))
+        struct.pack_into("<II", memory, 12, 1, rate)
+
+    def queryctrl(self, memory: memoryview) -> None:
+        asked = struct.unpack_from("<I", memory)[0]
+        later = sorted(number for number in self.controls if number > (asked & 0x7FFFFFFF))
+        if not later:
+            raise _error(errno.EINVAL)
+        control = self.controls[later[0]]
+        struct.pack_into("<II32s", memory, 0, later[0], 1, control.name)
+        struct.pack_into("<iii", memory, 40, control.low, control.high, control.step)
+
+    def enum_fmt(self, memory: memoryview) -> None:
+        index, kind = struct.unpack_from("<II", memory)
+        codes = list(dict.fromkeys(code for _, _, code in self.formats))
+        assert kind == 1, "of capture"
+        if index >= len(codes):
+            raise _error(errno.EINVAL)
+        struct.pack_into("<4s", memory, 44, codes[index])
+
+    def enum_framesizes(self, memory: memoryview) -> None:
+        index, asked = struct.unpack_from("<I4s", memory)
+        sizes = [(width, height) for width, height, code in self.formats if code == asked]
+        if index >= len(sizes):
+            raise _error(errno.EINVAL)
+        struct.pack_into("<III", memory, 8, 1, *sizes[index])
+
+    def enum_frameintervals(self, memory: memoryview) -> None:
+        index, code, width, height = struct.unpack_from("<I4sII", memory)
+        if (width, height, code) not in self.formats or index >= len(self.rates):
+            raise _error(errno.EINVAL)
+        struct.pack_into("<III", memory, 16, 1, 1, self.rates[index])
+
+    def s_ctrl(self, memory: memoryview) -> None:
+        number, value = struct.unpack_from("<Ii", memory)
+        if number == EXPOSURE and self.controls[EXPOSURE_AUTO].value == 3:
+            raise _error(errno.EACCES)  # as long as the automatic has it
+        control = self.controls[number]
+        control.value = value // control.step * control.step
+        self.settings.append((control.name.decode(), value))
+
+    def g_ctrl(self, memory: memoryview) -> None:
+        struct.pack_into("<i", memory, 4, self.controls[struct.unpack_from("<I", memory)[0]].value)
+
+    def reqbufs(self, memory: memoryview) -> None:
+        count, kind, how = struct.unpack_from("<III", memory)
+        assert (count, kind, how) == (4, 1, 1), "buffers for capture that are mapped"
+
+    def querybuf(self, memory: memoryview) -> None:
+        struct.pack_into("<I", memory, 64, struct.unpack_from("<I", memory)[0] * BUFFER_LENGTH)
+        struct.pack_into("<I", memory, 72, BUFFER_LENGTH)
+
+    def qbuf(self, memory: memoryview) -> None:
+        self.empty.append(struct.unpack_from("<I", memory)[0])
+
+    def dqbuf(self, memory: memoryview) -> None:
+        if self.failing:
+            raise _error(self.failing)
+        if not self.full:
+            raise _error(errno.EAGAIN)
+        index, length, stamp, sequence, flags = self.full.popleft()
+        struct.pack_into("<IIII", memory, 0, index, 1, length, flags)
+        seconds = math.floor(stamp)
+        struct.pack_into("<qq", memory, 24, seconds, min(round((stamp - seconds) * 1e6), 999_999))
+        struct.pack_into("<II", memory, 56, sequence, 1)
+
+    def streamon(self, memory: memoryview) -> None:
+        self.streaming = True
+
+    def streamoff(self, memory: memoryview) -> None:
+        self.streaming = False
+
 
 class FakeKernel(Kernel):
     """Cameras by the path of their device."""
@@ -172,136 +262,17 @@ class FakeKernel(Kernel):
             )
 
     def ioctl(self, descriptor: int, request: int, argument: ctypes.Structure | ctypes.c_int) -> None:
-        play = {
-            Request.QUERYCAP: _query_capabilities,
-            Request.S_FMT: _set_format,
-            Request.S_PARM: _set_rate,
-            Request.QUERYCTRL: _query_control,
-            Request.S_CTRL: _set_control,
-            Request.G_CTRL: _get_control,
-            Request.REQBUFS: _request_buffers,
-            Request.QUERYBUF: _query_buffer,
-            Request.QBUF: _queue,
-            Request.DQBUF: _dequeue,
-            Request.STREAMON: _start,
-            Request.STREAMOFF: _stop,
-            Request.ENUM_FMT: _list_formats,
-            Request.ENUM_FRAMESIZES: _list_sizes,
-            Request.ENUM_FRAMEINTERVALS: _list_intervals,
-        }[Request(request)]
+        asked = Request(request)
         with self._changed:
             camera = self.open_files[descriptor]
             if not camera.plugged:
                 raise _error(errno.ENODEV)
-            if play in {_set_format, _request_buffers} and camera.owner not in {None, descriptor}:
+            if asked in {Request.S_FMT, Request.REQBUFS} and camera.owner not in {None, descriptor}:
                 raise _error(errno.EBUSY)
-            if play is _request_buffers:
+            if asked is Request.REQBUFS:
                 camera.owner = descriptor
-            play(camera, memoryview(argument).cast("B"))
+            getattr(camera, asked.name.lower())(memoryview(argument).cast("B"))
             self._changed.notify_all()
-
-
-def _query_capabilities(camera: FakeCamera, memory: memoryview) -> None:
-    of_all_devices = 0x80000000 | VIDEO_CAPTURE | METADATA_CAPTURE | STREAMING
-    struct.pack_into("<32s", memory, 16, camera.card)
-    struct.pack_into("<III", memory, 80, 6 << 16, of_all_devices, camera.capabilities)
-
-
-def _set_format(camera: FakeCamera, memory: memoryview) -> None:
-    width, height, code = struct.unpack_from("<II4s", memory, 8)
-    camera.settings.append(("format", (width, height, code)))
-    if (width, height, code) not in camera.formats:
-        width, height, code = camera.formats[0]
-    row = 0 if code == b"MJPG" else 2 * width + camera.padding
-    struct.pack_into("<II4sIII", memory, 8, width, height, code, 1, row, BUFFER_LENGTH)
-
-
-def _set_rate(camera: FakeCamera, memory: memoryview) -> None:
-    numerator, denominator = struct.unpack_from("<II", memory, 12)
-    camera.settings.append(("rate", denominator / numerator))
-    rate = min(camera.rates, key=lambda rate: abs(rate - denominator / numerator))
-    struct.pack_into("<II", memory, 12, 1, rate)
-
-
-def _query_control(camera: FakeCamera, memory: memoryview) -> None:
-    asked = struct.unpack_from("<I", memory)[0]
-    later = sorted(number for number in camera.controls if number > (asked & 0x7FFFFFFF))
-    if not later:
-        raise _error(errno.EINVAL)
-    control = camera.controls[later[0]]
-    struct.pack_into("<II32s", memory, 0, later[0], 1, control.name)
-    struct.pack_into("<iii", memory, 40, control.low, control.high, control.step)
-
-
-def _list_formats(camera: FakeCamera, memory: memoryview) -> None:
-    index, kind = struct.unpack_from("<II", memory)
-    codes = list(dict.fromkeys(code for _, _, code in camera.formats))
-    assert kind == 1, "of capture"
-    if index >= len(codes):
-        raise _error(errno.EINVAL)
-    struct.pack_into("<4s", memory, 44, codes[index])
-
-
-def _list_sizes(camera: FakeCamera, memory: memoryview) -> None:
-    index, asked = struct.unpack_from("<I4s", memory)
-    sizes = [(width, height) for width, height, code in camera.formats if code == asked]
-    if index >= len(sizes):
-        raise _error(errno.EINVAL)
-    struct.pack_into("<III", memory, 8, 1, *sizes[index])
-
-
-def _list_intervals(camera: FakeCamera, memory: memoryview) -> None:
-    index, code, width, height = struct.unpack_from("<I4sII", memory)
-    if (width, height, code) not in camera.formats or index >= len(camera.rates):
-        raise _error(errno.EINVAL)
-    struct.pack_into("<III", memory, 16, 1, 1, camera.rates[index])
-
-
-def _set_control(camera: FakeCamera, memory: memoryview) -> None:
-    number, value = struct.unpack_from("<Ii", memory)
-    if number == EXPOSURE and camera.controls[EXPOSURE_AUTO].value == 3:
-        raise _error(errno.EACCES)  # as long as the automatic has it
-    control = camera.controls[number]
-    control.value = value // control.step * control.step
-    camera.settings.append((control.name.decode(), value))
-
-
-def _get_control(camera: FakeCamera, memory: memoryview) -> None:
-    struct.pack_into("<i", memory, 4, camera.controls[struct.unpack_from("<I", memory)[0]].value)
-
-
-def _request_buffers(camera: FakeCamera, memory: memoryview) -> None:
-    count, kind, how = struct.unpack_from("<III", memory)
-    assert (count, kind, how) == (4, 1, 1), "buffers for capture that are mapped"
-
-
-def _query_buffer(camera: FakeCamera, memory: memoryview) -> None:
-    struct.pack_into("<I", memory, 64, struct.unpack_from("<I", memory)[0] * BUFFER_LENGTH)
-    struct.pack_into("<I", memory, 72, BUFFER_LENGTH)
-
-
-def _queue(camera: FakeCamera, memory: memoryview) -> None:
-    camera.empty.append(struct.unpack_from("<I", memory)[0])
-
-
-def _dequeue(camera: FakeCamera, memory: memoryview) -> None:
-    if camera.failing:
-        raise _error(camera.failing)
-    if not camera.full:
-        raise _error(errno.EAGAIN)
-    index, length, stamp, sequence, flags = camera.full.popleft()
-    struct.pack_into("<IIII", memory, 0, index, 1, length, flags)
-    seconds = math.floor(stamp)
-    struct.pack_into("<qq", memory, 24, seconds, min(round((stamp - seconds) * 1e6), 999_999))
-    struct.pack_into("<II", memory, 56, sequence, 1)
-
-
-def _start(camera: FakeCamera, memory: memoryview) -> None:
-    camera.streaming = True
-
-
-def _stop(camera: FakeCamera, memory: memoryview) -> None:
-    camera.streaming = False
 
 
 def _release(camera: FakeCamera) -> None:

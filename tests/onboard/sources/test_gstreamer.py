@@ -22,7 +22,7 @@ from flockd.onboard.sources.gstreamer_device import GstreamerDevice, caps, forma
 from flockd.onboard.sources.image_formats import PACKED, CorruptImageError, MjpegFormat
 from tests.onboard.sources.watched import Watch
 
-FAKE = (sys.executable, "-IS", str(Path(__file__).with_name("fake_pipeline.py")))
+FAKE = (sys.executable, "-IS", str(Path(__file__).with_name("fake_child.py")))
 SIZE = (64, 48)
 RATE_HZ = 50.0
 CAMERA = CameraDeviceParameters(name="front", pipeline="any", rate_hz=RATE_HZ)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,7 +18,7 @@ from flockd.onboard.sources import camera_child
 from flockd.onboard.sources.camera_child import body_of, packed
 from flockd.onboard.sources.device_source import Devices
 from flockd.onboard.sources.ros_device import info_topic_of
-from tests.onboard.sources.fake_topics import __file__ as fake
+from tests.onboard.sources.test_gstreamer import FAKE
 from tests.onboard.sources.watched import Watch
 
 SIZE = (64, 48)
@@ -62,7 +61,7 @@ def start(watch: Watch, tmp_path: Path) -> Watch:
         named = [dict(zip(("kind", "data", "ms"), (one[0], one[1].hex(), *one[2:]), strict=False)) for one in messages]
         file.write_text("\n".join(json.dumps(one) for one in named), encoding="ascii")
         camera = CameraDeviceParameters(name="front", topic="/front/image_raw", rate_hz=50.0)
-        devices = Devices(ros_command=(sys.executable, "-IS", fake, str(file)), lenses={"front": LENS})
+        devices = Devices(ros_command=(*FAKE, str(file)), lenses={"front": LENS})
         return watch({"front": SIZE}, (camera,), devices, **more)
 
     return begin

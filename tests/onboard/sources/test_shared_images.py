@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 import threading
 import time
 from collections.abc import Mapping
@@ -28,7 +27,6 @@ from flockd.onboard.recording.reader import Recording
 from flockd.onboard.sources.device_source import Devices
 from tests.onboard.sources.camera_images import jpeg, scene
 from tests.onboard.sources.fake_kernel import FakeCamera, FakeKernel
-from tests.onboard.sources.fake_topics import __file__ as fake_topics
 from tests.onboard.sources.test_gstreamer import FAKE
 from tests.onboard.sources.test_ros_topics import RGB, image
 from tests.onboard.sources.watched import Watch, WatchedSource
@@ -216,7 +214,7 @@ def test_a_pipeline_and_a_topic_are_cut_likewise(watch: Watch, tmp_path: Path) -
     assert told.endswith("or correct crop_of")
 
     file = tmp_path / "messages"
-    topics = Devices(ros_command=(sys.executable, "-IS", fake_topics, str(file)))
+    topics = Devices(ros_command=(*FAKE, str(file)))
     file.write_text(json.dumps({"kind": "imag", "data": image().hex()}), encoding="ascii")
     frames = watch(sizes, _halves(topic="/all/image_raw"), topics).next().frames
     assert np.array_equal(np.concatenate([frames[name].image for name in HALVES], axis=1), RGB)

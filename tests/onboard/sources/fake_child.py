@@ -1,7 +1,9 @@
-"""Speaks like the process of a pipeline, by the words of what it reads; nothing of flockd's is imported here.
+"""Speaks like the process of a camera; nothing of flockd's is imported here.
 
-fake_pipeline.py CAPS    # and over standard input the length of the words, four bytes, and the words
+fake_child.py gstreamer CAPS    # and over standard input the length of the words, four bytes, and the words
+fake_child.py FILE ros ...      # each line of the file is JSON: kind, and the message in hexadecimal digits
 
+Of a file's messages `"ms"` is how long before the first one it was taken; without, now. Words are those of a pipeline:
 `caps:WxH` and `caps:text` say what the images are; `N` sends N different images of 64x48 in RGB, 20 ms apart.
 `short` sends one that lacks a byte, `flagged` one the driver calls damaged, `untimed` one without a time. `stall` waits
 until the other side goes, `fail:text` and `end` say so, `print` prints a line, `crash` ends by a signal, `once:FILE`
@@ -10,6 +12,7 @@ skips the word after it if FILE exists, and makes it. Underscores in texts are s
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import struct
@@ -76,5 +79,18 @@ def play(words: list[str]) -> None:
             WORDS[word](text)
 
 
-(length,) = struct.unpack("<I", os.read(0, 4))
-play(os.read(0, length).decode().split())
+def send_messages(file: Path) -> None:
+    """All of them; then it stalls."""
+    began_ns = time.monotonic_ns()
+    for one in map(json.loads, file.read_text(encoding="ascii").splitlines()):
+        time_ns = began_ns - 10**6 * one["ms"] if "ms" in one else time.monotonic_ns()
+        send(one["kind"].encode(), bytes.fromhex(one["data"]), time_ns=time_ns)
+        time.sleep(PERIOD_S)
+    sys.stdin.read()
+
+
+if sys.argv[1] == "gstreamer":
+    (length,) = struct.unpack("<I", os.read(0, 4))
+    play(os.read(0, length).decode().split())
+else:
+    send_messages(Path(sys.argv[1]))
