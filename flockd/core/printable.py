@@ -2,23 +2,14 @@
 
 from __future__ import annotations
 
-import unicodedata
-
-_STEERING = frozenset({"Cc", "Cf", "Cs", "Co", "Cn", "Zl", "Zp"})
-"""Unicode categories of characters that are escaped: control codes, changes of direction, surrogates, line ends."""
+import json
 
 
 def printable(text: str, *, lines: bool = True) -> str:
-    r"""The text with ``\u001b`` for an escape character, and so on, which is also how JSON writes it.
+    r"""The text with ``\u001b`` for an escape character, and so on, as JSON writes it: control codes, changes of
+    direction, surrogates, line ends, and spaces that are not the keyboard's.
 
     ``lines``: line feeds and tabs are kept.
     """
     kept = "\n\t" if lines else ""
-    if text.isprintable():
-        return text
-    return "".join(c if c in kept or unicodedata.category(c) not in _STEERING else _escaped(c) for c in text)
-
-
-def _escaped(character: str) -> str:
-    units = character.encode("utf-16-be", "surrogatepass")
-    return "".join(f"\\u{units[i] << 8 | units[i + 1]:04x}" for i in range(0, len(units), 2))
+    return "".join(c if c.isprintable() or c in kept else json.dumps(c)[1:-1] for c in text)

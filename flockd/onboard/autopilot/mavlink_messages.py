@@ -76,15 +76,11 @@ OTHER_CLOCK_MS, CLOCK_STAMPS, CLOCK_RETURNS = 100, 50, 3
 """Two autopilots of one id: so many of the last stamps are so much older than the stamp before, as the stamps of two
 clocks take turns. A restart goes back once, packets of one autopilot that overtake each other by less, and those that
 come over a second, slower way too have stamps that were there before."""
-STAMPS_END_MS, NEAR_END_MS = 1 << 32, 10_000
-"""Stamps wrap here to 0; and how near to the wrap two successive stamps have to be to count as one."""
 MAV_SEVERITY_WARNING = 4
 TEXTS_KEPT = 20
 TEXT_MEMORY_S = 10.0
 """Time for which a text counts as the reason of a refusal, and is not reported again."""
 MAV_TYPE_ONBOARD_CONTROLLER = 18
-SETTLED_S = 2.0
-"""Time after its first heartbeat by which an autopilot has sent its failed checks."""
 CHUNKS_S = 0.2
 """Longest time between the first and the last chunk of a text."""
 TEXT_CHUNK = 50
@@ -126,8 +122,8 @@ class ReceivedMessages:
         self.ranges_s: deque[float] = deque(maxlen=RANGES_KEPT)
         """Arrival times of its last readings."""
         self._other_computer_s = -math.inf
-        self._first_s, self._heard_s = math.inf, -math.inf
-        """Arrival times of its first heartbeat and of its newest message."""
+        self._heard_s = -math.inf
+        """Arrival time of its newest message."""
         self._max_gap_s = max_gap_s
         self._boot_ms = self._stamp_ms = 0
         self._returns: deque[bool] = deque(maxlen=CLOCK_STAMPS)
@@ -136,8 +132,6 @@ class ReceivedMessages:
         """The serial number of its board's processor, of PX4's simulator its instance; None: not known."""
         self.are_two = False
         """Whether stamps of two clocks or numbers of two boards were received: another autopilot has the same id."""
-        self._counted_ms = 0
-        """Milliseconds lost by wraps of 32-bit stamps since flockd listens: they wrap after 49.7 days."""
         self.restarts = 0
         """Restarts of the autopilot since flockd listens."""
         self.heartbeats_lost = 0
@@ -172,8 +166,6 @@ class ReceivedMessages:
         elif name == "POSITION_TARGET_LOCAL_NED":
             followed = [math.nan if fields.get(key) is None else float(fields[key]) for key in ("vx", "vy")]
             self.setpoints.followed(time_s, *followed, offboard=self.flight_mode() == "offboard")
-        if self._counted_ms and fields.get("time_boot_ms") is not None:
-            fields = {**fields, "time_boot_ms": fields["time_boot_ms"] + self._counted_ms}
         fields = self._without_jumps(name, fields)
         if name in STAMPED:
             arrived_s, time_s = time_s, self._stamped_s(name, fields, time_s)
@@ -216,16 +208,14 @@ class ReceivedMessages:
         return refusals(
             self.status(now_s),
             self.check_events,
-            {name: self._fields(name) for name in ("HEARTBEAT", "SYS_STATUS")},
+            int(self._fields("HEARTBEAT").get("system_status") or 0),
             now_s - self._other_computer_s < services.OTHER_HEARTBEAT.timeout,
             streams=streams,
-            settled=now_s - self._first_s >= SETTLED_S,
         )
 
     def _count_heartbeats(self, time_s: float) -> None:
         before = self._newest.get("HEARTBEAT")
         if before is None:
-            self._first_s = time_s
             return
         lost = round((time_s - before.time_s) * services.HEARTBEAT.rate_hz) - 1
         if lost > 0:
@@ -249,13 +239,11 @@ class ReceivedMessages:
             self._tell_two()
         if self.are_two:
             return
-        if boot_ms < NEAR_END_MS and self._boot_ms > STAMPS_END_MS - NEAR_END_MS:
-            self._counted_ms += STAMPS_END_MS
-        elif boot_ms < self._boot_ms - RESTARTED_MS:
+        if boot_ms < self._boot_ms - RESTARTED_MS:
             if int(self._fields("HEARTBEAT").get("base_mode") or 0) & MAV_MODE_FLAG_SAFETY_ARMED:
                 return
             self.restarts += 1
-            self._counted_ms, self._board = 0, None
+            self._board = None
             self.check_events, self.clock = CheckEvents(), ClockSync()
             self._report("the autopilot has started anew")
         self._boot_ms = boot_ms

@@ -46,8 +46,6 @@ MOST_LATE = 20
 """A number that goes back by more is not a late event: the autopilot has restarted its count."""
 SEQUENCE_RESET = 1
 """MAV_EVENT_CURRENT_SEQUENCE_FLAGS."""
-PREARM_CHECK = 1 << 28
-"""Bit of MAV_SYS_STATUS_SENSOR."""
 QUIET_ERRORS = frozenset({"check_system_safety_button", "check_modes_mission"})
 """PX4 sends them as information, but still refuses to arm."""
 REMEMBERED_S = 15.0
@@ -164,25 +162,23 @@ class CheckEvents:
 def refusals(
     status: AutopilotStatus,
     events: CheckEvents,
-    messages: Mapping[str, Mapping[str, Any]],
+    system_status: int,
     other_computers: bool,
     *,
     streams: bool,
-    settled: bool,
 ) -> tuple[Refusal, ...]:
     """Why it would refuse now, the cause first; empty in offboard flight and if no reason is known.
 
     Args:
         status: the newest one.
         events: the reports of PX4's checks.
-        messages: the newest fields of SYS_STATUS and HEARTBEAT, by name.
+        system_status: MAV_STATE of the newest heartbeat.
         other_computers: whether another onboard computer is heard.
         streams: whether flockd sends setpoints.
-        settled: whether an autopilot that reports its checks by events had time to do so.
     """
     found = [_refusal(SEVERAL_SENDERS, "")] if other_computers else []
     if not (status.armed and status.flight_mode == "offboard"):
-        state = OF_STATE.get(int(messages["HEARTBEAT"].get("system_status") or 0))
+        state = OF_STATE.get(system_status)
         found += [] if state is None else [_refusal(state, "to arm")]
         # A switch to offboard was just attempted.
         denied = events.denied
@@ -190,8 +186,6 @@ def refusals(
         report = events.report
         if report is not None:
             found += _of_report(report, status, streams=streams, asked=asked)
-        elif not status.armed and settled and _checks_fail(messages["SYS_STATUS"]):
-            found.append(_refusal(CHECKS_FAIL, "to arm"))
         found += _of_denial(events, status, found)
     return _few({refusal.reason: refusal for refusal in reversed(found)})
 
@@ -232,12 +226,6 @@ def _blocking(report: CheckReport, state: int, status: AutopilotStatus) -> list[
     manual = status.flight_mode in MANUAL_MODES
     warned = [check for check in failed if check.level == WARNING and (manual or NAMES.get(check.number) != STICKS)]
     return certain or warned or [FailedCheck(event_number(CHECKS_FAIL), ALL_MODES, ERROR)]
-
-
-def _checks_fail(system: Mapping[str, Any]) -> bool:
-    """Whether checks fail by SYS_STATUS, for firmware that does not report which."""
-    enabled, healthy = (int(system.get(f"onboard_control_sensors_{what}") or 0) for what in ("enabled", "health"))
-    return bool(enabled & ~healthy & PREARM_CHECK)
 
 
 def _of_denial(events: CheckEvents, status: AutopilotStatus, found: Sequence[Refusal]) -> Iterator[Refusal]:

@@ -160,7 +160,7 @@ class RefusalWatch:
             # Only on the ground. After lost events, `AutopilotLink.attend` asks too, also in flight.
             if not self._link.knows_checks() and not self._link.status().armed and now - asked_s >= ASK_AGAIN_S:
                 asked_s = now
-                with suppress(AutopilotError, TimeoutError):  # firmware without the list has single messages
+                with suppress(AutopilotError, TimeoutError):
                     async with asyncio.timeout(ASK_AGAIN_S):
                         await self._link.ask_for_checks()
             await asyncio.sleep(CHECKS_POLL_S)

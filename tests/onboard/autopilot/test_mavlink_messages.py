@@ -212,19 +212,6 @@ def test_two_whose_clocks_agree_are_told_apart_by_their_boards(boards: list[int 
     assert sum("two autopilots with the same system id" in text for text in log) == two
 
 
-def test_stamps_that_begin_at_0_after_49_days_are_no_restart() -> None:
-    """2^32 ms; the positions' come on the same clock. One that begins anew later has restarted."""
-    attitude, position = POSE
-    stamps = ((2**32 - 20, attitude), (5, attitude), (10, position), (35_000, attitude))
-    received, log = _received(*((name, {**fields, "time_boot_ms": stamp}) for stamp, (name, fields) in stamps))
-    assert (received.restarts, log) == (0, [])
-    newest = received.newest("LOCAL_POSITION_NED")
-    assert newest is not None
-    assert newest.fields["time_boot_ms"] == 2**32 + 10
-    received.add(attitude[0], {**attitude[1], "time_boot_ms": 7}, 9.0)
-    assert received.restarts == 1
-
-
 def test_a_text_of_just_one_chunk_is_seen_when_it_does_not_go_on() -> None:
     received, log = _received(_text("a" * 50))
     received.add("SYS_STATUS", {"battery_remaining": 50}, 0.1)

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from flockd.onboard.autopilot.mavlink_messages import ReceivedMessages
-from flockd.onboard.autopilot.refusal_reasons import CHECKS_FAIL, NAMES, REASONS, event_number
+from flockd.onboard.autopilot.refusal_reasons import NAMES, REASONS, event_number
 
 HOLD, POSITION, LAND, OFFBOARD = (4 << 16 | 3 << 24), 3 << 16, (4 << 16 | 6 << 24), 6 << 16
 ARMED = 128
@@ -174,14 +174,8 @@ def test_arming_that_was_refused_is_told_for_a_while(event: str, words: str) -> 
     assert story.sentences() == []
 
 
-def test_of_a_firmware_without_events_its_state_and_that_its_checks_fail_are_told() -> None:
+def test_what_it_is_busy_with_is_a_reason() -> None:
     story = Story()
-    story.send("SYS_STATUS", onboard_control_sensors_enabled=0x10200007, onboard_control_sensors_health=0x00200003)
-    assert story.sentences() == [], "an autopilot that has a list of checks would be wronged in its first second"
-    story.now_s += 2.0
-    assert [refusal.reason for refusal in story.received.refusals(story.now_s, streams=False)] == [CHECKS_FAIL]
-    story.send("SYS_STATUS", onboard_control_sensors_enabled=0x10200007, onboard_control_sensors_health=0x10200003)
-    assert story.sentences() == [], "all checks pass: what is not healthy is not needed"
     story.send("HEARTBEAT", custom_mode=HOLD, base_mode=0, system_status=2)
     assert "a calibration is under way" in story.sentences()[0]
 

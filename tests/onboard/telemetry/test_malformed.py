@@ -251,7 +251,7 @@ def test_two_drones_of_one_name_are_told_apart_by_identity_and_neither_gets_an_o
         ("a\u202eb", "a\\u202eb"),
         ("half \ud800", "half \\ud800"),
         ("tag \U000e0041", "tag \\udb40\\udc41"),
-        ("two\nlines\r", "two\nlines\\u000d"),
+        ("two\nlines\r", "two\nlines\\r"),
     ],
 )
 def test_what_would_steer_a_terminal_is_written_as_an_escape(text: str, shown: str) -> None:
