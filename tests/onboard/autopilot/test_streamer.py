@@ -230,13 +230,6 @@ def test_what_is_not_sent_has_its_reason(story: Story, change: dict[str, object]
     assert story.silence == told
 
 
-def test_the_first_reason_for_an_end_is_kept(in_offboard: Story) -> None:
-    in_offboard.streamer.end("the supervisor holds")
-    in_offboard.streamer.end("closed")
-    assert in_offboard.go_on(1.0) == 0
-    assert in_offboard.silence == "the supervisor holds"
-
-
 def test_the_thread_keeps_its_rate_and_ends_when_the_gate_breaks() -> None:
     sent: list[float] = []
     gate_works = True

@@ -120,17 +120,6 @@ def test_sets_go_on_without_a_camera_that_has_gone_and_with_it_when_it_is_back()
     assert stage.count("back", "lost") == 0, "it counts from zero again"
 
 
-def test_a_camera_that_was_never_there_is_waited_for_once() -> None:
-    stage = Stage("front", "back")
-    stage.send("front", 0.0)
-    assert stage.take() is None
-    stage.now_s += 0.101
-    assert stage.stamps() == {"front": 0.0}
-    stage.send("front", 0.1)
-    assert stage.stamps() == {"front": 0.1}
-    assert stage.assembler.age_s("back", stage.now_s) == math.inf
-
-
 def test_one_camera_out_of_step_does_not_part_the_others() -> None:
     """The left camera is 15 ms off where 5 ms are allowed: what goes on after the wait is the larger part."""
     stage = Stage("front", "right", "left", set_tolerance_s=0.005)
