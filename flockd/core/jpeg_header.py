@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 
 MAX_IMAGE_PIXELS = 1 << 26
 """8192 x 8192: more than any drone's camera has. The command line also sets it as OpenCV's limit."""
@@ -36,32 +37,31 @@ def jpeg_end(data: bytes) -> int | None:
 
     Markers inside thumbnails, or behind the JPEG, do not count.
     """
-    at = 2 if data.startswith(_JPEG) else len(data)
-    while at + 2 <= len(data) and data[at] == 0xFF:
-        marker = data[at + 1]
-        if marker == _END:
-            return at + 2
-        if marker == 0xFF or marker in _STANDALONE:
-            at += 1 if marker == 0xFF else 2
-            continue
-        at += 2 + int.from_bytes(data[at + 2 : at + 4])
-        if marker == _SCAN:
-            found = _AFTER_SCAN.search(data, at)
-            at = len(data) if found is None else found.end() - 2
-    return None
+    return next((at for marker, at in _segments(data) if marker == _END), None)
 
 
 def jpeg_size(data: bytes) -> tuple[int, int] | None:
     """Width and height in the frame header; None: the data are no JPEG, or have no header before the first scan."""
-    at = 2 if data.startswith(_JPEG) else len(data)
-    while at + 9 <= len(data) and data[at] == 0xFF:
-        marker = data[at + 1]
-        if marker == 0xFF or marker in _STANDALONE:
-            at += 1 if marker == 0xFF else 2
-        elif marker in _FRAME_HEADERS:
-            return int.from_bytes(data[at + 7 : at + 9]), int.from_bytes(data[at + 5 : at + 7])
-        elif marker == _SCAN:
-            return None
-        else:
-            at += 2 + int.from_bytes(data[at + 2 : at + 4])
+    for marker, at in _segments(data):
+        if marker in _FRAME_HEADERS and at + 7 <= len(data):
+            return int.from_bytes(data[at + 5 : at + 7]), int.from_bytes(data[at + 3 : at + 5])
+        if marker == _SCAN:
+            break
     return None
+
+
+def _segments(data: bytes) -> Iterator[tuple[int, int]]:
+    """Each marker of the JPEG at the beginning, and the index behind it."""
+    at = 2 if data.startswith(_JPEG) else len(data)
+    while at + 2 <= len(data) and data[at] == 0xFF:
+        marker = data[at + 1]
+        if marker == 0xFF:
+            at += 1
+            continue
+        at += 2
+        yield marker, at
+        if marker not in _STANDALONE:
+            at += int.from_bytes(data[at : at + 2])
+        if marker == _SCAN:
+            found = _AFTER_SCAN.search(data, at)
+            at = len(data) if found is None else found.end() - 2
