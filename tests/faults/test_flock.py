@@ -1,4 +1,4 @@
-"""Faults in the flock and of the own command: neighbours and commands are put in where the tracker and the law end."""
+"""Faults in the flock and of the own command: neighbours and commands are set behind the tracker and the law."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Numbers go through JSON and come back the same to the last bit."""
+"""Messages go through JSON and come back the same to the last bit."""
 
 from __future__ import annotations
 

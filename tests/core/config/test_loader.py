@@ -1,4 +1,4 @@
-"""A person writes a configuration, makes a slip, and is told where it is and how to mend it."""
+"""Mistakes in a configuration are told with file, line, key and remedy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The frame of the autopilot's positions: what moves with it, and what is no jump."""
+"""Jumps of the frame of the autopilot's positions are taken out; turns and corrections are no jumps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whose setpoints the autopilot follows: nobody is accused of what the autopilot or the link does."""
+"""Setpoints of another program are told from flockd's own that the autopilot clips or the link delays."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Two autopilots on one link: which is the own one is never guessed."""
+"""Two autopilots on one link: flockd does not guess which is its own."""
 
 from __future__ import annotations
 

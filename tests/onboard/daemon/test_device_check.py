@@ -1,4 +1,4 @@
-"""The device check itself needs a virtual machine; these need nothing."""
+"""What the check of a device relies on: the documented installation, and the file of its drone."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Operators' orders: each counts once, while it is new and for the drone that it names, and however many come."""
+"""An operator's order counts once, while it is new, for the drone that it names; many orders fill no log."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who reads the log slowly, or not at all, does not stop the daemon."""
+"""A slow reader of the log, or none, does not delay the daemon."""
 
 from __future__ import annotations
 

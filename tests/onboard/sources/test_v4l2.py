@@ -1,4 +1,4 @@
-"""Cameras are plugged in, pulled out, disturbed and taken by others; the kernel's side of it is a fake."""
+"""Cameras that are plugged in, unplugged, disturbed and in use elsewhere; the kernel is a fake."""
 
 from __future__ import annotations
 

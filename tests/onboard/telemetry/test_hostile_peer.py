@@ -1,4 +1,4 @@
-"""What a peer can cost a drone: one query that is too long, more queries than it answers, more peers than it takes."""
+"""What a peer can cost a drone: a query that is too long, many queries at once, many peers."""
 
 from __future__ import annotations
 
