@@ -13,9 +13,6 @@ from flockd.core.messages import Float32Array, FloatArray
 from flockd.flight.geometry.depth_maps import RangeMap
 from flockd.flight.geometry.rig import RigCamera
 
-_DEPTH_AGREEMENT = 0.05
-"""Neighbouring depths that differ by more are of two surfaces and are not interpolated."""
-
 
 @dataclass(frozen=True, eq=False)
 class Columns:
@@ -87,8 +84,7 @@ def lift_matches(
     pixels_current = pixels_previous + _nearest(flow, pixels_previous)
     inside = camera.camera.in_image(pixels_current).nonzero()[0]
     pixels_previous, pixels_current = pixels_previous.take(inside, axis=0), pixels_current.take(inside, axis=0)
-    range_previous = _sample_depth(depth_previous, pixels_previous)
-    range_current = _sample_depth(depth_current, pixels_current)
+    range_previous, range_current = _nearest(depth_previous, pixels_previous), _nearest(depth_current, pixels_current)
     # NaN compares false, so depths that are not finite are dropped too.
     kept = (range_previous > 0.0) & (range_previous <= max_depth_m)
     kept &= (range_current > 0.0) & (range_current <= max_depth_m)
@@ -114,24 +110,3 @@ def _nearest(values: NDArray[_Value], pixels: FloatArray) -> NDArray[_Value]:
     column, row = pixels.astype(np.int64).T
     found: NDArray[_Value] = values[row, column]
     return found
-
-
-def _sample_depth(depth: RangeMap, pixels: FloatArray) -> FloatArray:
-    """(n,) depth between pixel centres: bilinear if the four around agree, else that of the nearest pixel."""
-    height, width = depth.shape
-    # Pixel index i has its centre at i + 0.5; beyond the outermost centres the border repeats.
-    x, y = np.minimum(np.maximum(pixels - 0.5, 0.0), (width - 1, height - 1)).T
-    left, top = np.minimum(x.astype(np.int64), width - 2), np.minimum(y.astype(np.int64), height - 2)
-    right, below = x - left, y - top
-    first, flat = top * width + left, depth.ravel()
-    corners = [flat.take(first + to).astype(np.float64) for to in (0, 1, width, width + 1)]
-    a, b, c, d = corners
-    nearest = np.where(below < 0.5, np.where(right < 0.5, a, b), np.where(right < 0.5, c, d))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        # A plane's inverse range, not its range, is nearly linear from one pixel to the next.
-        above = (1 - right) * (1 - below) / a + right * (1 - below) / b
-        blended = 1.0 / (above + (1 - right) * below / c + right * below / d)
-        low, high = np.minimum.reduce(corners), np.maximum.reduce(corners)
-        agree = (low > 0.0) & (high - low <= _DEPTH_AGREEMENT * low)
-    sampled: FloatArray = np.where(agree, blended, nearest)
-    return sampled
