@@ -52,7 +52,7 @@ RANGE_SLOPE = Check(
     ("perception.range_finder.max_slope",),
 )
 RANGE_REPEATED = Check(
-    "change of the barometer's height, while eight ranges and more are the same to the last bit",
+    "change of the barometer's height, while all ranges are the same to the last bit",
     0.5,
     "m",
     "the range finder is not used before it says something else, and agrees",

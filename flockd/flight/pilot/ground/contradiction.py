@@ -23,8 +23,6 @@ from flockd.flight.pilot.own_motion import ERROR_LASTS_S, ERROR_M_S, SCALE
 
 PROBATION_S = 3.0
 """Time for which a blamed range finder has to agree with itself before it is used again."""
-REPEATED = 8
-"""Equal readings in a row that count as stuck: of noise of 1 cm in whole centimetres, chance once in ten thousand."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,8 +30,6 @@ class GroundPoint:
     """A point of the ground that a range finder measured."""
 
     time_s: float
-    reading_s: float
-    """Time of the measurement. Several steps may have the same one."""
     place: FloatArray
     """(2,) metres north and east of a fixed origin: the drone's place. The beam's also moves with its tilt."""
     range_m: float
@@ -55,10 +51,6 @@ class ContradictionMonitor:
         """Height of the ground before the range finder was blamed."""
         self._same: GroundPoint | None = None
         """The first of the readings that are equal to the last bit."""
-        self._times = 0
-        """How many of them there are."""
-        self._reading_s = -math.inf
-        """Time of the newest of them."""
         self.forget()
 
     def forget(self) -> None:
@@ -80,11 +72,8 @@ class ContradictionMonitor:
     def see_repetition(self, point: GroundPoint) -> None:
         """Blames the range finder if its readings stay equal while the height changes."""
         if self._same is None or point.range_m != self._same.range_m:
-            self._same, self._times = point, 0
-        self._times += point.reading_s != self._reading_s  # a reading counts once
-        self._reading_s = point.reading_s
-        climbed_m = abs(point.height_m - self._same.height_m)
-        if climbed_m >= RANGE_REPEATED.limit and self._times >= REPEATED:
+            self._same = point
+        elif abs(point.height_m - self._same.height_m) >= RANGE_REPEATED.limit:
             self.doubt("the range stays the same while the height changes")
 
     def see_way(self, elapsed_s: float, flown: FloatArray, by_images: FloatArray) -> None:

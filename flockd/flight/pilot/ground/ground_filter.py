@@ -98,9 +98,7 @@ class GroundFilter:
             return fault
         point = reading.range_m * vehicle.R_ned_body[:, 2]
         ground_m = _height_at(reading.time_s, vehicle) - float(point[2])
-        self._newest = GroundPoint(
-            vehicle.time_s, reading.time_s, self._flown, reading.range_m, vehicle.height_m, ground_m
-        )
+        self._newest = GroundPoint(vehicle.time_s, self._flown, reading.range_m, vehicle.height_m, ground_m)
         self._contradictions.see_repetition(self._newest)
         variance = (self._parameters.noise * reading.range_m) ** 2 + HEIGHT_NOISE_M**2
         row = np.array([1.0, point[0], point[1]])
