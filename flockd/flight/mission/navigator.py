@@ -49,7 +49,7 @@ class Navigator:
         if guidance.height_m is not None:
             self._height_m = guidance.height_m
         height_m = None if self._height_m is None else self._height_m + self._configured.height_offset_m
-        if self._course_rad is None and moment.time_s > 0.0:  # what a mission begins with is taken at once
+        if self._course_rad is None:
             self._course_rad = moment.heading_rad
         is_paper = self._parameters.kind == "circle_then_tangent"
         course_rad = guidance.course_rad if is_paper else self._turned(guidance.course_rad, moment.time_s)

@@ -46,8 +46,7 @@ class Weave:
         self._base_m: float | None = None
         """Height at which the newest weave began; the drone stays at it if the mission gives no height."""
         self._wanted_m: float | None = None
-        self._steady_since_s: float | None = None
-        """Since when the mission's height is unchanged: a flock changes its height together."""
+        """The mission's height when it began: a flock changes its height together, so the weave then ends."""
 
     @property
     def moves(self) -> bool:
@@ -74,34 +73,30 @@ class Weave:
         """
         if any(one.confirmed and abs(one.velocity[2]) > _CLIMB_M_S for one in neighbours):
             self._climbed_s = time_s
-        if self._steady_since_s is None:  # a flight begins at its height
-            self._wanted_m, self._steady_since_s = wanted_m, time_s - PERIOD_S
-        elif wanted_m != self._wanted_m:
-            self._wanted_m, self._steady_since_s = wanted_m, time_s
         if self._began_s is None:
-            if needed and self._begins(time_s, height_m, above_ground_m, neighbours):
-                self._began_s, self._base_m = time_s, height_m
-        elif not needed or self._steady_since_s > self._began_s or self.is_over(time_s):
+            base_m = height_m if wanted_m is None else wanted_m
+            if needed and self._begins(time_s, height_m, above_ground_m, base_m, neighbours):
+                self._began_s, self._base_m, self._wanted_m = time_s, height_m, wanted_m
+        elif not needed or wanted_m != self._wanted_m or self.is_over(time_s):
             self._began_s, self._next_s = None, time_s + _DRAWN_WITHIN_S  # others first
         base_m = self._base_m if wanted_m is None else wanted_m
         if self._began_s is None or base_m is None:
             return base_m
         return base_m + _ASKED_M * math.sin(2 * math.pi * (time_s - self._began_s) / PERIOD_S)
 
-    def _begins(self, time_s: float, height_m: float, above_ground_m: float, neighbours: Sequence[Neighbour]) -> bool:
+    def _begins(
+        self, time_s: float, height_m: float, above_ground_m: float, base_m: float, neighbours: Sequence[Neighbour]
+    ) -> bool:
         if self._next_s is None:
             self._next_s = time_s + self._random.uniform(0.0, _DRAWN_WITHIN_S)
         if time_s < self._next_s:
             return False
         self._next_s = time_s + self._random.uniform(0.0, _DRAWN_WITHIN_S / 2)
-        assert self._steady_since_s is not None
-        base_m = height_m if self._wanted_m is None else self._wanted_m
         room_m = min(base_m - self._gate.min_height_m, self._gate.max_height_m - base_m)
         seen = [one for one in neighbours if one.confirmed]
         column_m = COLUMN * self._gate.degraded_separation_m
         return (
             above_ground_m >= _ABOVE_GROUND_M
-            and time_s - self._steady_since_s >= PERIOD_S
             and abs(height_m - base_m) <= _ROOM_M
             and room_m >= _ASKED_M + _ROOM_M
             and time_s - self._climbed_s >= PERIOD_S / 2
