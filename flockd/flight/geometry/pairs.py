@@ -84,7 +84,8 @@ def lift_matches(
     pixels_current = pixels_previous + _nearest(flow, pixels_previous)
     inside = camera.camera.in_image(pixels_current).nonzero()[0]
     pixels_previous, pixels_current = pixels_previous.take(inside, axis=0), pixels_current.take(inside, axis=0)
-    range_previous, range_current = _nearest(depth_previous, pixels_previous), _nearest(depth_current, pixels_current)
+    range_previous = _nearest(depth_previous, pixels_previous).astype(np.float64)
+    range_current = _nearest(depth_current, pixels_current).astype(np.float64)
     # NaN compares false, so depths that are not finite are dropped too.
     kept = (range_previous > 0.0) & (range_previous <= max_depth_m)
     kept &= (range_current > 0.0) & (range_current <= max_depth_m)
