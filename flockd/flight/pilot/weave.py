@@ -74,8 +74,8 @@ class Weave:
         if any(one.confirmed and abs(one.velocity[2]) > _CLIMB_M_S for one in neighbours):
             self._climbed_s = time_s
         if self._began_s is None:
-            base_m = height_m if wanted_m is None else wanted_m
-            if needed and self._begins(time_s, height_m, above_ground_m, base_m, neighbours):
+            begin_m = height_m if wanted_m is None else wanted_m
+            if needed and self._begins(time_s, height_m, above_ground_m, begin_m, neighbours):
                 self._began_s, self._base_m, self._wanted_m = time_s, height_m, wanted_m
         elif not needed or wanted_m != self._wanted_m or self.is_over(time_s):
             self._began_s, self._next_s = None, time_s + _DRAWN_WITHIN_S  # others first
