@@ -4,7 +4,6 @@ from flockd.flight.geometry.cameras import Camera, PinholeCamera, WideAngleCamer
 from flockd.flight.geometry.depth_maps import RangeMap, ZMap, range_map
 from flockd.flight.geometry.ego_motion import estimate_ego_motion, moved_pixels
 from flockd.flight.geometry.ground import ground_inverse_depth
-from flockd.flight.geometry.ground_fit import GroundSamples, fit_ground
 from flockd.flight.geometry.pairs import PointPairs, grid_pixels, lift_matches
 from flockd.flight.geometry.polar import log_polar, log_polar_covariance, log_polar_residual
 from flockd.flight.geometry.rig import R_FRD_RDF, Rig, RigCamera, build_rig
@@ -26,7 +25,6 @@ from flockd.flight.geometry.virtual_camera import VirtualCrops, virtual_crops
 __all__ = [
     "R_FRD_RDF",
     "Camera",
-    "GroundSamples",
     "PinholeCamera",
     "PointPairs",
     "RangeMap",
@@ -39,7 +37,6 @@ __all__ = [
     "build_rig",
     "estimate_ego_motion",
     "euler_from_rotation",
-    "fit_ground",
     "fit_rigid",
     "grid_pixels",
     "ground_inverse_depth",

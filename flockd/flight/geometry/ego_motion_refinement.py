@@ -18,7 +18,7 @@ from flockd.flight.geometry.transform import RigidTransform
 
 _MAX_PAIRS = 800
 """Number of pairs used, drawn at random; each has two residuals."""
-FLOW_SIGMA_PX = 0.3
+_FLOW_SIGMA_PX = 0.3
 _DEPTH_SIGMA = 0.05
 """Relative error of depth. Only its ratio to the flow's error matters: residuals show the common scale."""
 _CAUCHY_SIGMAS = 1.2
@@ -165,7 +165,7 @@ class _Weighting:
     @classmethod
     def learned(cls, state: _Reprojection, typical: BoolArray) -> _Weighting:
         """From the parallax of all residuals, and the median size of the ``typical`` (m,) ones."""
-        white_by = whitening(state.parallaxes, FLOW_SIGMA_PX, _DEPTH_SIGMA)
+        white_by = whitening(state.parallaxes, _FLOW_SIGMA_PX, _DEPTH_SIGMA)
         squared = (times(white_by, state.residuals) ** 2).sum(axis=0)
         # Fewer than half outliers do not move the median, which is sqrt(2 ln 2) sigma of a Rayleigh distribution.
         sigma = max(math.sqrt(median(squared[typical]) / (2.0 * math.log(2.0))), 1e-3)

@@ -42,7 +42,7 @@ from flockd.flight.perception import Networks, Observation, Perception, load_net
 from flockd.flight.perception.detection.detector import DetectionTrace
 from flockd.flight.perception.interface import KnownSize
 from flockd.flight.pilot.camera_agreement import CameraAgreement, moves_otherwise
-from flockd.flight.pilot.ground import GroundFilter, scaled_by_ground
+from flockd.flight.pilot.ground import GroundFilter
 from flockd.flight.pilot.motions import background_pairs
 from flockd.flight.pilot.own_motion import OwnMotion
 from flockd.flight.pilot.size_learner import SizeLearner
@@ -228,7 +228,7 @@ class FlockPilot:
         if observation.previous is not None:
             interval_s = min(observation.interval_s, _LONGEST_S)
             try:
-                ego = self._scaled(observation, self._by_images(observation), ground)
+                ego = self._by_images(observation)
             except ValueError as error:
                 reasons.append(f"ego-motion: {error}")
             else:
@@ -248,18 +248,6 @@ class FlockPilot:
         if observation.previous is not None:
             self._agreement.see(observation.previous.vehicle, observation.vehicle, observation.interval_s, pairs)
         return estimate_ego_motion(pairs, self._rig, observation.interval_s, self._config.geometry)
-
-    def _scaled(self, observation: Observation, ego: EgoMotion, ground: GroundEstimate | None) -> EgoMotion:
-        """The own motion in the range finder's scale if the ground gives it, else unchanged."""
-        if ground is None or self._ground is None:
-            return ego
-        track = self._ground.track(observation.vehicle)
-        try:
-            scaled, slope = scaled_by_ground(self._rig, observation, ego, ground, track)
-        except ValueError:  # standing still, or over water and walls: keep the depth maps' scale
-            return ego
-        self._ground.see_slope(slope)
-        return scaled
 
     def _measurements(self, observation: Observation) -> tuple[tuple[Detection, ...], list[Measurement], list[Reason]]:
         """The detections that the tracker uses, their measurements, and the reasons for those left out."""

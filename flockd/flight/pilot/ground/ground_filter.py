@@ -1,14 +1,13 @@
-"""The ground below the drone as a plane, estimated from ranges, the own motion and the slope that images show.
+"""The ground below the drone as a plane, estimated from ranges and the own motion.
 
 A Kalman filter with three states: the ground's height below the drone, in the frame of the autopilot's height, and its
 slopes to the north and to the east. As the drone moves, the height changes by the slope. A range measures the height at
-one point; successive points show the slope along the path, images the slope across it.
+one point; successive points show the slope along the path.
 """
 
 from __future__ import annotations
 
 import math
-from collections import deque
 
 import numpy as np
 
@@ -21,12 +20,8 @@ HEIGHT_NOISE_M = 0.03
 """Standard deviation of the autopilot's height between readings. Its slow drift does not matter here."""
 SLOPE_CHANGE = 0.02
 """Standard deviation of the change of slope per metre: a hill of 5 m goes from 15 % up to 15 % down in 100 m."""
-SEEN_SLOPE = 0.04
-"""Standard deviation, each axis, of a slope from images. Rough ground has bumps, which images show too."""
 ROUGHNESS_M = 0.03
 """Standard deviation by which the ground departs from its slope over a metre."""
-TRACK_POINTS = 100
-"""Points of the ground that are kept: 10 s at ten steps a second."""
 
 
 class GroundFilter:
@@ -50,13 +45,6 @@ class GroundFilter:
         """(3,) displacement in the newest step by the autopilot's velocities, metres NED; None: not known."""
         self._used_height_m = 0.0
         """Height above the ground from which the newest step's scale follows."""
-        self._track: deque[FloatArray] = deque(maxlen=TRACK_POINTS)
-        """(3,) each: metres north and east of the start, and height of the ground, where a range hit it."""
-
-    def track(self, vehicle: VehicleState) -> FloatArray:
-        """(k, 3) metres NED from the drone: where the last ranges hit the ground, as of the last `update`."""
-        places = np.array(self._track).reshape(-1, 3)
-        return np.column_stack([places[:, :2] - self._flown, vehicle.height_m - places[:, 2]])
 
     def update(self, vehicle: VehicleState) -> tuple[GroundEstimate | None, Reason | None]:
         """The ground in this step, and the reason if another source than the configured one is used."""
@@ -73,11 +61,6 @@ class GroundFilter:
             reason = Reason(ReasonKind.HEIGHT, f"height: {fault}; there is no scale")
         self._used_height_m = 0.0 if ground is None else ground.height_m
         return ground, reason
-
-    def see_slope(self, slope: FloatArray) -> None:
-        """Takes the slope (2,), north and east, that the images of the newest step show."""
-        if self._state is not None:
-            self._correct(np.eye(3)[1:], slope, np.eye(2) * SEEN_SLOPE**2)
 
     def see_motion(self, displacement: FloatArray) -> None:
         """Takes the displacement (3,), metres NED, that images show in the newest step, in the scale of its ground."""
@@ -107,16 +90,15 @@ class GroundFilter:
         home = None if vehicle.position is None else self._flown - vehicle.position
         why = self._contradictions.update(self._newest, home)
         if why is not None:  # earlier readings may have been wrong as well
-            self._forget()
+            self._state = None
             return why
         if self._state is None:
             self._state = np.array([ground_m, 0.0, 0.0])
             slope = self._parameters.max_slope / self._parameters.gate_sigma
             self._covariance = np.diag([variance, slope**2, slope**2])
         else:
-            self._correct(row[None], np.array([ground_m]), np.array([[variance]]))
+            self._correct(row, ground_m, variance)
         self._measured_s = vehicle.time_s
-        self._track.append(np.array([*(self._flown + point[:2]), ground_m]))
         return None
 
     def _is_unexplained(self, row: FloatArray, ground_m: float, variance: float) -> bool:
@@ -136,7 +118,7 @@ class GroundFilter:
         self._elapsed_s, self._moved = vehicle.time_s - last.time_s, _moved(last, vehicle)
         way = _way(last, vehicle)
         if way is None or not 0.0 < self._elapsed_s <= self._parameters.compare_s:
-            self._forget()
+            self._state = None
             self._contradictions.forget()
             return
         self._flown = self._flown + way
@@ -149,16 +131,12 @@ class GroundFilter:
         self._state = onward @ self._state
         self._covariance = onward @ self._covariance @ onward.T + np.diag(change)
 
-    def _forget(self) -> None:
-        self._state = None
-        self._track.clear()
-
-    def _correct(self, rows: FloatArray, measured: FloatArray, noise: FloatArray) -> None:
+    def _correct(self, row: FloatArray, ground_m: float, variance: float) -> None:
         assert self._state is not None
-        gain = self._covariance @ rows.T @ np.linalg.inv(rows @ self._covariance @ rows.T + noise)
-        self._state = self._state + gain @ (measured - rows @ self._state)
-        kept = np.eye(3) - gain @ rows
-        self._covariance = kept @ self._covariance @ kept.T + gain @ noise @ gain.T  # Joseph's form keeps it symmetric
+        gain = self._covariance @ row / (row @ self._covariance @ row + variance)
+        self._state = self._state + gain * (ground_m - row @ self._state)
+        kept = np.eye(3) - np.outer(gain, row)  # Joseph's form keeps it symmetric
+        self._covariance = kept @ self._covariance @ kept.T + variance * np.outer(gain, gain)
 
 
 def reading_fault(reading: RangeReading | None, now_s: float, parameters: RangeFinderParameters) -> str | None:
