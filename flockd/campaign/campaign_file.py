@@ -17,7 +17,7 @@ FlightKindName = Literal["truth", "sight"]
 """How the flights of a campaign are flown."""
 
 DRONES = "drones"
-"""Instead of a key: the size of the flock."""
+"""Stands in the place of a key: the size of the flock."""
 MAX_VALUES = 1000
 MAX_SEEDS = 1_000_000
 _Name = Annotated[Name, Field(max_length=60)]
@@ -28,13 +28,6 @@ class Variation(Section):
 
     values: Annotated[tuple[Any, ...], Field(min_length=1, max_length=MAX_VALUES)]
     """Values of the grid."""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _has_no_range(cls, given: Any) -> Any:
-        if isinstance(given, dict) and {"low", "high", "steps"} & given.keys():
-            raise ValueError("`low`, `high` and `steps` are gone; write each value in the list `values`")
-        return given
 
 
 class CampaignConfig(Section):
@@ -106,7 +99,7 @@ class CampaignConfig(Section):
 
 
 def load_campaign(path: Path | str) -> tuple[CampaignConfig, Mapping[KeyPath, Place]]:
-    """A campaign's file, and the place of each value in it; of its scenario only the path. Raises ConfigError."""
+    """A campaign's file, and the place of each value in it. The scenario's file is not read. Raises ConfigError."""
     document = read_document(Path(path), "campaign")
     require(document, "campaign")
     return validated(CampaignConfig, document), document.places

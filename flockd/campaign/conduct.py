@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from flockd.campaign.engine import Engine
+from flockd.campaign.engine import ProcessEngine
 from flockd.campaign.flight_kinds import figures_flown
 from flockd.campaign.flight_plan import Plan, Run
 from flockd.campaign.folder import CampaignFolder, flown_in
@@ -16,7 +16,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Conducted:
-    """What was flown now."""
+    """How many flights one call has flown."""
 
     flown: int
     failed: int
@@ -24,10 +24,11 @@ class Conducted:
     """Flights that were done already."""
 
 
-def conduct(plan: Plan, folder: CampaignFolder, engine: Engine, progress: Progress) -> Conducted:
-    """Flies what is missing. ``progress`` gets (done now, of how many).
+def conduct(plan: Plan, folder: CampaignFolder, engine: ProcessEngine, progress: Progress) -> Conducted:
+    """Flies the flights of a plan that its folder does not hold yet.
 
-    The table is written at the end, and when this is interrupted.
+    ``progress`` is called with (flights done now, flights to do). The table is written at the end, and after an
+    interruption.
     """
     done_before = {one.run for one in flown_in(folder.path, plan)}
     runs = ((cell, number) for cell in plan.cells for number in range(plan.config.seeds))
@@ -57,9 +58,9 @@ SHORT_STEPS, LONG_STEPS = 3, {"truth": 60, "sight": 9}
 
 
 def estimate(plan: Plan, progress: Callable[[int, int], None]) -> float:
-    """Mean processor time of a flight, s, by short ones of the first, the middle and the last cell, on this thread.
+    """Mean processor time of a flight, s, from short trial flights of the first, middle and last cell on this thread.
 
-    Raises what flying raises.
+    ``progress`` is called with (cells done, cells to try). Raises the errors of `flockd.sim.flock.swarm.fly`.
     """
     cells = sorted({0, len(plan.cells) // 2, len(plan.cells) - 1})
     progress(0, len(cells))

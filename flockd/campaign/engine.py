@@ -7,10 +7,9 @@ import os
 import signal
 import sys
 from collections import Counter, deque
-from collections.abc import Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from concurrent.futures.process import BrokenProcessPool
-from typing import Protocol, Self
+from typing import Self
 
 import cv2
 from joblib.externals.loky import ProcessPoolExecutor
@@ -26,29 +25,12 @@ MAX_TRIES = 3
 """How often a flight may end the process that flies it."""
 
 
-class Engine(Protocol):
-    """Flies tasks side by side, in any order. What a task gives is what `fly_task` gives, wherever it is flown."""
-
-    @property
-    def room(self) -> int:
-        """How many more tasks it takes now."""
-        ...
-
-    def submit(self, task: Task) -> None:
-        """Takes a task."""
-        ...
-
-    def wait(self) -> Sequence[FlownRun]:
-        """Results of submitted tasks that have finished since the last call; waits for at least one, if any is under
-        way."""
-        ...
-
-
 class ProcessEngine:
-    """Between ``__enter__`` and ``__exit__``. Its processes end with this one, however that ends.
+    """Flies tasks side by side in ``workers`` processes, in any order, between ``__enter__`` and ``__exit__``.
 
-    When a process dies, the executor cannot say which task it flew, and all that it had begun are lost. Each of them is
-    then flown by itself, which shows whose flight it was; the processes are new.
+    The processes end with this one, however that ends. When a process dies, the executor cannot say which task it
+    flew, and all tasks that it had begun are lost. Each of them is then flown alone in new processes, which shows the
+    flight that ends its process.
     """
 
     def __init__(self, workers: int) -> None:
@@ -68,7 +50,8 @@ class ProcessEngine:
 
     @property
     def room(self) -> int:
-        """For each process one that it flies and one that it goes on with; none while suspects fly by themselves."""
+        """How many more tasks it takes now: two a process, one to fly and one to go on with; none while suspects fly
+        alone."""
         return 0 if self._suspects else 2 * self._workers - len(self._flying)
 
     def submit(self, task: Task) -> None:
@@ -81,7 +64,7 @@ class ProcessEngine:
                 self._restarted()
 
     def wait(self) -> list[FlownRun]:
-        """What is finished; waits for one at least."""
+        """Results of the tasks that have finished since the last call. Waits for one, if any task is submitted."""
         finished: list[FlownRun] = []
         while not finished and (self._flying or self._suspects):
             if not self._flying:
@@ -99,7 +82,7 @@ class ProcessEngine:
         return finished
 
     def _restarted(self) -> list[FlownRun]:
-        """With a new executor. Gives the results of tasks that have ended too many processes."""
+        """Starts a new executor. Returns results that are known, of tasks that ended too many processes too."""
         wait(self._flying)  # all of them break
         lost = [task for future, task in self._flying.items() if future.exception() is not None]
         finished = [future.result() for future in self._flying if future.exception() is None]

@@ -1,4 +1,4 @@
-"""What a campaign measures of a flight: one number for each figure, or none."""
+"""The figures that a campaign measures of each flight, and the confidence interval of a mean."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
 from scipy.special import ndtri, stdtrit
 
-from flockd.core.messages import BoolArray, FloatArray
+from flockd.core.messages import FloatArray
 from flockd.review.flight_log.log import FlightLog
-from flockd.review.report.summary import TAIL_S, estimation_errors, objective_sums, summarise
+from flockd.review.report.summary import estimation_errors, objective_sums, summarise, tail_of
 
 
 class Interval(NamedTuple):
@@ -37,9 +37,10 @@ _UPPER_END = 0.975
 
 
 def mean_interval(values: Sequence[float], *, is_share: bool = False) -> Interval | None:
-    """By Student's t; of values that are 0 or 1 (``is_share``) by Wilson's score. None where there is none.
+    """The mean of values (n,) with its 95 % confidence interval: by Student's t, or, of values that are 0 or 1
+    (``is_share``), by Wilson's score.
 
-    One value tells nothing of how much they differ. E. B. Wilson, "Probable inference, the law of succession, and
+    None for fewer than two values; of 0 and 1 for none. E. B. Wilson, "Probable inference, the law of succession, and
     statistical inference", 1927.
     """
     n = len(values)
@@ -60,7 +61,7 @@ Figures = dict[str, float | None]
 
 @dataclass(frozen=True)
 class Measure:
-    """One figure: how it is called, and which way it is better."""
+    """One figure: its name, its unit, and the direction in which it is better."""
 
     name: str
     unit: str
@@ -72,19 +73,15 @@ class Measure:
 
 
 def _nearest_at_the_end(log: FlightLog, _: dict[str, Any]) -> float:
-    places = log.position[_tail(log)][:, :, None, :2]
+    places = log.position[tail_of(log)][:, :, None, :2]
     apart = np.linalg.norm(places - places.swapaxes(1, 2), axis=-1)
     return float(np.where(apart > 0, apart, np.inf).min(axis=2).mean())
-
-
-def _tail(log: FlightLog) -> BoolArray:
-    return np.asarray(log.time_s > log.time_s[-1] + log.metadata.step_s - TAIL_S - 1e-6)
 
 
 def _tail_mean(name: str) -> Callable[[FlightLog, dict[str, Any]], float]:
     def mean(log: FlightLog, _: dict[str, Any]) -> float:
         sums = objective_sums(log, log.position, log.velocity)[name]
-        return float(np.mean(sums[_tail(log)]))
+        return float(np.mean(sums[tail_of(log)]))
 
     return mean
 
@@ -157,7 +154,7 @@ Figure = Annotated[str, AfterValidator(_known), Field(json_schema_extra={"enum":
 
 
 def figures_of(log: FlightLog, wanted: Iterable[Figure]) -> Figures:
-    """The wanted figures of a flight; None where a flight of its kind has none, or it is not finite."""
+    """The wanted figures of a flight; None where this kind of flight has no such figure, or it is not finite."""
     summary = summarise(log)
     return {figure: _value(MEASURES[figure].of, log, summary) for figure in wanted}
 

@@ -1,4 +1,4 @@
-"""How the flight of a task is flown, and what is kept of it."""
+"""Flies one flight of a campaign, and keeps its figures and where they come from."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def figures_flown(scenario: ScenarioConfig, task: Task) -> Figures:
 
 @dataclass(frozen=True)
 class FlownRun:
-    """What came of one flight."""
+    """The result of one flight."""
 
     run: Run
     figures: Figures = field(default_factory=dict)
@@ -45,24 +45,25 @@ class FlownRun:
     networks: str = ""
     """SHA-256 of each network, as `name=hash`."""
     wall_s: float = 0.0
-    cpu_s: float = 0.0
     began: str = ""
+    """Wall time, ISO 8601."""
     host: str = ""
     process: int = 0
 
 
 def fly_task(task: Task) -> FlownRun:
-    """Flies it. A flight that cannot be flown has its reason."""
-    wall_s, cpu_s, began = time.perf_counter(), time.process_time(), datetime.now(UTC).isoformat(timespec="seconds")
+    """Flies one flight. An error of any kind becomes the reason of its result."""
+    begin_s, began = time.perf_counter(), datetime.now(UTC).isoformat(timespec="seconds")
+    figures, reason, sha256, networks = Figures(), None, "", ""
     try:
         scenario = _single_threaded(task.scenario())
         figures = figures_flown(scenario, task)
         networks = _networks(scenario.drone.perception) if task.config.perception == "sight" else ""
+        sha256 = hashlib.sha256(scenario.model_dump_json().encode()).hexdigest()
     except Exception as error:  # noqa: BLE001 - whatever it is, it is one flight's result
-        return _failed(task.run, error, began, time.perf_counter() - wall_s)
-    wall_s, cpu_s = time.perf_counter() - wall_s, time.process_time() - cpu_s
-    sha256 = hashlib.sha256(scenario.model_dump_json().encode()).hexdigest()
-    return FlownRun(task.run, figures, None, sha256, networks, wall_s, cpu_s, began, platform.node(), os.getpid())
+        reason = _reason(error)
+    wall_s = time.perf_counter() - begin_s
+    return FlownRun(task.run, figures, reason, sha256, networks, wall_s, began, platform.node(), os.getpid())
 
 
 def _single_threaded(scenario: ScenarioConfig) -> ScenarioConfig:
@@ -71,13 +72,12 @@ def _single_threaded(scenario: ScenarioConfig) -> ScenarioConfig:
     return scenario.model_copy(update={"drone": scenario.drone.model_copy(update={"perception": perception})})
 
 
-def _failed(run: Run, error: Exception, began: str, wall_s: float) -> FlownRun:
-    """An expected error is its sentence; of another one the place says more."""
-    reason = str(error) if isinstance(error, FlockdError) else f"{type(error).__name__}: {error}"
-    if not isinstance(error, FlockdError):
-        places = traceback.extract_tb(error.__traceback__)
-        reason += f" ({os.path.basename(places[-1].filename)}:{places[-1].lineno})"  # noqa: PTH119 - no file is meant
-    return FlownRun(run, reason=reason, began=began, wall_s=wall_s, host=platform.node(), process=os.getpid())
+def _reason(error: Exception) -> str:
+    """The sentence of an expected error; of another one also its type and the line that raised it."""
+    if isinstance(error, FlockdError):
+        return str(error)
+    place = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{type(error).__name__}: {error} ({os.path.basename(place.filename)}:{place.lineno})"  # noqa: PTH119
 
 
 @lru_cache(maxsize=64)

@@ -1,15 +1,14 @@
-"""The folder of a campaign: every finished flight is in it at once, and it can be gone on with after any end.
+"""The folder of a campaign: it holds each flight as soon as that has ended, and a campaign goes on after any end.
 
-`campaign.json` is the plan. `flights.jsonl` gets a line for each finished flight; of several of one flight the first
-counts, and a last line that was cut off is none. `flights.csv` is written from it at the end, in order of cells and
-seeds, with what is the same whatever flew it.
+`campaign.json` is the plan. `flights.jsonl` gets a line for each finished flight; of several lines of one flight the
+first counts, and a last line that was cut off does not. `flights.csv` is written from it at the end, in order of cells
+and seeds, without what depends on the computer.
 """
 
 from __future__ import annotations
 
 import csv
 import fcntl
-import io
 import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,6 +22,7 @@ from pydantic import TypeAdapter, ValidationError
 from flockd import __version__
 from flockd.campaign.flight_kinds import FlownRun
 from flockd.campaign.flight_plan import Plan, Run
+from flockd.core.data import written_whole
 from flockd.core.errors import UnavailableError, UsageError
 from flockd.onboard.message_json import parsed
 
@@ -37,7 +37,7 @@ _FLOWN = TypeAdapter(FlownRun)
 
 
 class CampaignFolder:
-    """Between ``__enter__`` and ``__exit__`` for this process alone."""
+    """The folder, open for writing by this process alone between ``__enter__`` and ``__exit__``."""
 
     def __init__(self, path: Path, plan: Plan) -> None:
         """Raises UsageError for a folder of another campaign, or with other files."""
@@ -46,7 +46,7 @@ class CampaignFolder:
         _check(path, plan)
 
     def __enter__(self) -> Self:
-        """Makes the folder, and tidies it. Raises UsageError where another process flies it."""
+        """Makes the folder, and removes a cut-off line. Raises UsageError if another process flies this campaign."""
         self.path.mkdir(parents=True, exist_ok=True)
         with ExitStack() as stack:
             lock = stack.enter_context(_ordinary(self.path / _LOCK).open("w", encoding="utf-8"))
@@ -55,7 +55,8 @@ class CampaignFolder:
             except BlockingIOError:
                 fault = "another process is flying this campaign; wait, or end that one"
                 raise UsageError(f"{self.path}: {fault}") from None
-            _write(self.path / PLAN_NAME, self._plan.to_json().encode())
+            with written_whole(self.path / PLAN_NAME) as draft:
+                draft.write_text(self._plan.to_json(), encoding="utf-8")
             lines = stack.enter_context(_ordinary(self.path / LINES_NAME).open("ab"))
             lines.truncate(sum(map(len, _whole_lines(self.path / LINES_NAME))))
             self._lines = lines
@@ -66,19 +67,18 @@ class CampaignFolder:
         self._stack.close()
 
     def add(self, flown: Sequence[FlownRun]) -> None:
-        """Keeps finished flights: on the disk when this returns."""
+        """Writes finished flights; they are on the disk when this returns."""
         self._lines.write(b"".join(_FLOWN.dump_json(one) + b"\n" for one in flown))
         self._lines.flush()
         os.fsync(self._lines.fileno())
 
     def write_table(self) -> None:
-        """Writes the table anew. Raises UnavailableError where a line cannot be read."""
+        """Writes `flights.csv` again. Raises UnavailableError if a line of `flights.jsonl` cannot be read."""
         rows = flight_rows(self._plan, flown_in(self.path, self._plan))
-        text = io.StringIO()
-        table = csv.DictWriter(text, list(rows[0]) if rows else (), lineterminator="\n")
-        table.writeheader()
-        table.writerows({name: _shown(value) for name, value in row.items()} for row in rows)
-        _write(self.path / FLIGHTS_NAME, text.getvalue().encode())
+        with written_whole(self.path / FLIGHTS_NAME) as draft, draft.open("w", encoding="utf-8", newline="") as file:
+            table = csv.DictWriter(file, list(rows[0]) if rows else (), lineterminator="\n")
+            table.writeheader()
+            table.writerows({name: _shown(value) for name, value in row.items()} for row in rows)
 
 
 def _shown(value: Any) -> str:
@@ -87,9 +87,9 @@ def _shown(value: Any) -> str:
 
 
 def flown_in(path: Path, plan: Plan) -> list[FlownRun]:
-    """The finished flights of a campaign's folder, in order of cells and seeds.
+    """The finished flights in a campaign's folder, in order of cells and seeds.
 
-    Raises UnavailableError where a line cannot be read or is another campaign's.
+    Raises UnavailableError for a line that cannot be read, or of another campaign.
     """
     lines, found = _ordinary(path / LINES_NAME), dict[Run, FlownRun]()
     for number, line in enumerate(_whole_lines(lines), 1):
@@ -107,7 +107,7 @@ def flown_in(path: Path, plan: Plan) -> list[FlownRun]:
 
 
 def flight_rows(plan: Plan, flown: Sequence[FlownRun]) -> list[dict[str, Any]]:
-    """One row for each flight, of what is the same whatever flew it."""
+    """One row of `flights.csv` for each flight: values that do not depend on the computer that flew it."""
     origin = {"perception": plan.config.perception, "flockd_version": __version__}
     origin |= {"numpy_version": np.__version__, "campaign_sha256": plan.sha256}
     return [
@@ -129,7 +129,7 @@ def flight_rows(plan: Plan, flown: Sequence[FlownRun]) -> list[dict[str, Any]]:
 
 
 def _whole_lines(path: Path) -> list[bytes]:
-    """The last line is none where a kill has cut it off."""
+    """Without a last line that a kill has cut off."""
     lines = path.read_bytes().splitlines(keepends=True) if path.exists() else []
     return lines[:-1] if lines and not lines[-1].endswith(b"\n") else lines
 
@@ -141,7 +141,7 @@ def _ordinary(path: Path) -> Path:
 
 
 def load_plan(path: Path) -> Plan:
-    """The plan of a campaign's folder. Raises UsageError where there is none."""
+    """The plan in a campaign's folder. Raises UsageError if it holds no valid one."""
     try:
         return Plan.from_values(_plan_values(path))
     except ValueError as error:
@@ -149,7 +149,7 @@ def load_plan(path: Path) -> Plan:
 
 
 def _plan_values(path: Path) -> Any:
-    """What the plan's file holds. Raises UsageError."""
+    """The plan's file as JSON. Raises UsageError."""
     file = path / PLAN_NAME
     if not file.exists():
         raise UsageError(f"{path}: holds no campaign, as it has no {PLAN_NAME}; name another folder")
@@ -170,7 +170,7 @@ def _check(path: Path, plan: Plan) -> None:
         raise UsageError(f"{path}: is a file; name a folder with --out")
     if not path.is_dir() or not any(path.iterdir()):
         return
-    others = {entry.name for entry in path.iterdir() if entry.suffix != ".part"}
+    others = {entry.name for entry in path.iterdir() if ".part" not in entry.suffixes}
     if others - _OURS:
         raise UsageError(f"{path}: holds other files than a campaign's; name a new or empty folder with --out")
     if not (path / PLAN_NAME).exists():
@@ -178,7 +178,7 @@ def _check(path: Path, plan: Plan) -> None:
     old, new = _plan_values(path), json.loads(plan.to_json())
     if not isinstance(old, dict):
         raise _no_plan(path, ValueError("it holds something else"))
-    difference = next(differences(old, new), None) if old != new else None  # NaN is no difference
+    difference = next(differences(old, new), None)
     if difference is not None:
         key, before, now = difference
         raise UsageError(
@@ -194,24 +194,9 @@ def _check(path: Path, plan: Plan) -> None:
 
 
 def differences(first: Any, second: Any, key: str = "") -> Iterator[tuple[str, str, str]]:
-    """Keys, dotted, whose values differ, each with both values as JSON; of a key that only one has, `null`."""
+    """Dotted keys whose values differ, each with both values as JSON; `null` where only one side has the key."""
     if isinstance(first, Mapping) and isinstance(second, Mapping):
         for name in dict.fromkeys([*first, *second]):
             yield from differences(first.get(name), second.get(name), f"{key}.{name}" if key else name)
     elif json.dumps(first) != json.dumps(second):
         yield key, json.dumps(first), json.dumps(second)
-
-
-def _write(path: Path, data: bytes) -> None:
-    """At once or not at all, and on the disk."""
-    temporary = path.with_name(f".{path.name}.part")
-    with temporary.open("wb") as stream:
-        stream.write(data)
-        stream.flush()
-        os.fsync(stream.fileno())
-    temporary.replace(path)
-    descriptor = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

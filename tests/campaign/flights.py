@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import random
-from collections.abc import Sequence
+import signal
 from pathlib import Path
 
 from flockd.campaign.conduct import Conducted, conduct
+from flockd.campaign.engine import ProcessEngine
 from flockd.campaign.figures import Figures
 from flockd.campaign.flight_kinds import FlownRun, fly_task
-from flockd.campaign.flight_plan import Plan, Task
+from flockd.campaign.flight_plan import Plan, Run, Task
 from flockd.campaign.folder import CampaignFolder
 from flockd.core.data import data_path
 from flockd.sim.scenario import ScenarioConfig
@@ -30,7 +32,7 @@ def campaign_file(folder: Path, text: str, head: str = HEAD) -> Path:
     return path
 
 
-class Shuffled:
+class Shuffled(ProcessEngine):
     """An engine that flies in this process, one task after the other, in an order drawn from a seed."""
 
     def __init__(self, seed: int, room: int = 5, until: int | None = None) -> None:
@@ -45,7 +47,7 @@ class Shuffled:
     def submit(self, task: Task) -> None:
         self._waiting.append(task)
 
-    def wait(self) -> Sequence[FlownRun]:
+    def wait(self) -> list[FlownRun]:
         if self._left == 0:
             raise KeyboardInterrupt
         if self._left is not None:
@@ -54,9 +56,16 @@ class Shuffled:
         return [fly_task(self._waiting.pop())]
 
 
-def flown(plan: Plan, folder: Path, engine: Shuffled) -> Conducted:
+def flown(plan: Plan, folder: Path, engine: ProcessEngine) -> Conducted:
     with CampaignFolder(folder, plan) as campaign:
         return conduct(plan, campaign, engine, lambda done, total: None)
+
+
+def fly_or_end(task: Task) -> FlownRun:
+    """Flies a task in a process of its own, which the second flight ends."""
+    if task.run == Run(0, 1):
+        os.kill(os.getpid(), signal.SIGKILL)
+    return fly_task(task)
 
 
 def made_up(scenario: ScenarioConfig, task: Task) -> Figures:

@@ -10,19 +10,17 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from flockd.campaign.conduct import conduct
-from flockd.campaign.engine import Engine, ProcessEngine
+from flockd.campaign.engine import ProcessEngine
 from flockd.campaign.flight_kinds import FlownRun
 from flockd.campaign.flight_plan import Plan, Run
-from flockd.campaign.folder import LINES_NAME, CampaignFolder
-from tests.campaign.flights import PAPER, Shuffled, campaign_file, flown
+from flockd.campaign.folder import LINES_NAME
+from tests.campaign.flights import PAPER, Shuffled, campaign_file, flown, fly_or_end
 
 FEW = f"campaign: test\nscenario: {PAPER}\nseeds: 3\nscatter_m: 0.5\nfixed: {{duration_s: 2}}\n"
 
@@ -32,21 +30,19 @@ def few(folder: Path, seeds: int = 3, duration_s: float = 2.0) -> Plan:
     return Plan.load(campaign_file(folder, "", text))
 
 
-def expected(plan: Plan, folder: Path) -> bytes:
-    flown(plan, folder / "expected", Shuffled(1))
-    return (folder / "expected" / "flights.csv").read_bytes()
-
-
-def flown_on(plan: Plan, folder: Path, engine: Engine) -> bytes:
-    with CampaignFolder(folder, plan) as campaign:
-        conduct(plan, campaign, engine, lambda done, total: None)
+def table(plan: Plan, folder: Path, engine: ProcessEngine) -> bytes:
+    flown(plan, folder, engine)
     return (folder / "flights.csv").read_bytes()
+
+
+def expected(plan: Plan, folder: Path) -> bytes:
+    return table(plan, folder / "expected", Shuffled(1))
 
 
 def test_a_process_gives_the_same_flights(tmp_path: Path) -> None:
     plan = few(tmp_path)
     with ProcessEngine(1) as engine:
-        assert flown_on(plan, tmp_path / "out", engine) == expected(plan, tmp_path)
+        assert table(plan, tmp_path / "out", engine) == expected(plan, tmp_path)
     lines = (tmp_path / "out" / LINES_NAME).read_text().splitlines()
     assert os.getpid() not in {json.loads(line)["process"] for line in lines}
 
@@ -68,7 +64,7 @@ def test_a_process_that_dies_is_replaced(tmp_path: Path) -> None:
 
     with ProcessEngine(2) as engine:
         threading.Thread(target=kill_some, daemon=True).start()
-        assert flown_on(plan, tmp_path / "out", engine) == expected(plan, tmp_path)
+        assert table(plan, tmp_path / "out", engine) == expected(plan, tmp_path)
     assert len(killed) == 3
 
 
@@ -88,26 +84,11 @@ def workers_of(parent: int) -> set[int]:
 
 @pytest.mark.slow
 @pytest.mark.whole_flight
-def test_a_flight_that_ends_its_process_is_a_row(tmp_path: Path) -> None:
+def test_a_flight_that_ends_its_process_is_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """One flight always ends its process; the others, which were lost with it, are flown."""
-    plan = few(tmp_path)
+    monkeypatch.setattr("flockd.campaign.engine.fly_task", fly_or_end)
+    plan, results = few(tmp_path), list[FlownRun]()
     with ProcessEngine(2) as engine:
-        submit = engine._executor.submit
-
-        def submitted(work: Callable[..., Any], task: Any) -> Any:
-            return submit(_end if task.run == Run(0, 1) else work, task)
-
-        engine._executor.submit = submitted
-        started = engine._started
-
-        def again() -> Any:
-            nonlocal submit
-            executor = started()
-            submit, executor.submit = executor.submit, submitted
-            return executor
-
-        engine._started = again  # type: ignore[method-assign]
-        results: list[FlownRun] = []
         for number in range(3):
             engine.submit(plan.task(plan.cells[0], number))
         while len(results) < 3:
@@ -115,10 +96,6 @@ def test_a_flight_that_ends_its_process_is_a_row(tmp_path: Path) -> None:
     reasons = {one.run: one.reason for one in results}
     assert reasons[Run(0, 0)] is reasons[Run(0, 2)] is None
     assert "the process that flew it ended, 3 times" in (reasons[Run(0, 1)] or "")
-
-
-def _end(_: object) -> None:
-    os.kill(os.getpid(), signal.SIGKILL)
 
 
 @contextmanager

@@ -23,7 +23,7 @@ def test_a_changed_campaign_is_read_or_refused(tmp_path: Path) -> None:
     flown = [FlownRun(Run(cell, number), {"order_tail": 0.9}) for cell in range(2) for number in range(2)]
     with CampaignFolder(path, plan) as campaign:
         campaign.add(flown)
-        campaign.write_table()  # Arrow starts its threads before memory is bounded
+        campaign.write_table()
     originals = {one.relative_to(path): one.read_bytes() for one in path.rglob("*") if one.is_file()}
     values = json.loads(originals[Path(PLAN_NAME)])
 

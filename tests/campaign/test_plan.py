@@ -113,10 +113,6 @@ def test_a_plan_is_its_own_copy(tmp_path: Path) -> None:
             "vary:\n  duration_s: {values: [5.0, 6.0, 5.0]}\n",
             "6: vary.duration_s.values[2]: 5.0 is given already; delete one",
         ),
-        (
-            "vary:\n  duration_s: {low: 5, high: 3, steps: 4}\n",
-            "6: vary.duration_s: `low`, `high` and `steps` are",
-        ),
         ("measure: [min_distance]\n", "5: measure[0]: min_distance is not known; did you mean `min_distance_m`?"),
         ("fixed: {seed: 3}\n", "5: fixed.seed: is set for each flight"),
         ("perception: control\n", "5: perception: "),

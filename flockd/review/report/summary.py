@@ -209,7 +209,7 @@ def _handed_over(log: FlightLog) -> Json:
 
 def _table_3(log: FlightLog) -> Json:
     totals: dict[str, dict[str, FloatArray]] = {}
-    tail = _tail(log)  # all of it has to follow the circle's end, where Eq. 44 changes its branch
+    tail = tail_of(log)  # all of it has to follow the circle's end, where Eq. 44 changes its branch
     if log.has_truth and not tail.all() and np.all(log.time_s[tail] >= log.metadata.circle_until_s):
         totals["vision" if log.metadata.by_sight else "truth"] = objective_sums(log, log.position, log.velocity)
         if log.metadata.by_sight and len(log.truth_position):
@@ -229,7 +229,7 @@ def _convergence(
     """
     if totals is None:
         return {"time_s": None, "error": None, "shape_bias": None}
-    tail = _tail(log)
+    tail = tail_of(log)
     mean = totals[name][tail].mean()
     off = np.abs(totals[name] - mean)
     outside = np.flatnonzero(off > CONVERGENCE_BAND[name])
@@ -250,7 +250,7 @@ def _flock(log: FlightLog) -> Json:
     steps = range(len(log.time_s))
     pairs = np.triu_indices(log.position.shape[1], 1)
     nearest = closest_distances(log.position)[:, *pairs].min(axis=1, initial=np.inf)
-    tail = np.flatnonzero(_tail(log))
+    tail = np.flatnonzero(tail_of(log))
     reach_m = log.metadata.observation_distance_m
     hovers = np.linalg.norm(log.velocity[tail, :, :2], axis=-1).mean() < HOVERS_M_S
     return {
@@ -312,8 +312,8 @@ def _relative_positions(log: FlightLog) -> FloatArray:
     return np.asarray(log.position[:, None] - log.position[:, :, None], dtype=float)
 
 
-def _tail(log: FlightLog) -> BoolArray:
-    """The steps of the last 10 s; all of a shorter flight."""
+def tail_of(log: FlightLog) -> BoolArray:
+    """(S,): the steps of the last 10 s; all steps of a shorter flight."""
     begin_s = log.time_s[-1] + log.metadata.step_s - TAIL_S
     return np.asarray(log.time_s > begin_s - 1e-6, dtype=bool)  # the step that begins just then belongs to it
 
