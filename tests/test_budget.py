@@ -25,7 +25,7 @@ LINES = {
     "flockd/onboard": 9_220,
     "flockd/fleet": 2_740,
     "flockd/ground": 5_280,
-    "flockd/review": 3_600,
+    "flockd/review": 3_550,
     "flockd/sim": 8_930,
     "flockd/campaign": 1_450,
     "flockd/cli": 3_820,

@@ -223,7 +223,7 @@ def _reference(args: argparse.Namespace) -> Mapping[int, Mapping[str, Any]] | No
 def _say_result(args: argparse.Namespace, comparison: Comparison | None, result: Mapping[str, Any]) -> None:
     say(
         f"{result['drone']}: {result['steps']} steps, {result['duration_s']:g} s, "
-        f"{result['realtime_factor']:.2f} x real time, {100 * result['reading_share']:.0f} % of it reading"
+        f"{result['realtime_factor']:.2f} x real time"
     )
     if args.out is not None:
         say(f"recording: {args.out}")

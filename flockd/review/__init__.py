@@ -1,1 +1,1 @@
-"""After a flight: its log, replay, report and view."""
+"""After a flight: its log, its replay and its report."""

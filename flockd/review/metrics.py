@@ -1,7 +1,7 @@
 """Figures of a flock at one instant: the paper's two objectives (Eq. 44, 45) and the measures common in the field.
 
 The measures of the field follow Soria, Schiano and Floreano, "The influence of limited visual sensing on the Reynolds
-flocking algorithm" (2019): order, union, connectivity, safety. Positions are (n, 2) or (n, 3) metres: distances are
+flocking algorithm" (2019): order, union, safety. Positions are (n, 2) or (n, 3) metres: distances are
 taken over the axes given.
 """
 
@@ -62,19 +62,6 @@ def union(positions: FloatArray, interaction_distance_m: float) -> float:
     return (n - components) / (n - 1)
 
 
-def connectivity(positions: FloatArray, interaction_distance_m: float) -> float:
-    """Second smallest eigenvalue of the interaction graph's Laplacian over n: 1 where all see all, 0 if it falls apart.
-
-    1 for a single UAV.
-    """
-    n = len(positions)
-    if n < 2:
-        return 1.0
-    edges = _adjacency(pair_distances(positions), interaction_distance_m).astype(float)
-    laplacian = np.diag(edges.sum(axis=1)) - edges
-    return max(float(np.linalg.eigvalsh(laplacian)[1]) / n, 0.0)
-
-
 def safety(positions: FloatArray, collision_radius_m: float = 0.5) -> float:
     """1 - the share of pairs nearer than twice the collision radius. 1 for a single UAV."""
     n = len(positions)
@@ -100,7 +87,7 @@ def closest_distances(positions: FloatArray) -> FloatArray:
 
 
 def pair_distances(positions: FloatArray) -> FloatArray:
-    """(n, n) m."""
+    """Distances (n, n) m between all pairs of positions (n, k) m."""
     return np.asarray(np.linalg.norm(positions[:, None] - positions[None], axis=2), dtype=float)
 
 

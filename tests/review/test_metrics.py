@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from flockd.core.messages import FloatArray
-from flockd.review.metrics import closest_approach, connectivity, min_distance, obj1, order, safety, union
+from flockd.review.metrics import closest_approach, min_distance, obj1, order, safety, union
 
 
 def test_obj1_is_the_cosine_on_the_circle_and_the_l1_distance_after_it() -> None:
@@ -41,11 +41,6 @@ def row(count: int) -> FloatArray:
         (union(TWO_PAIRS, 5.0), 2 / 3),
         (union(row(1), 1.0), 1.0),
         (union(row(33), 1.0), 1.0),
-        # complete graphs, of which every eigenvalue but the first is n, and paths: 2 - 2 cos(pi / n)
-        *((connectivity(row(n), 100.0), 1.0) for n in (2, 5, 9)),
-        *((connectivity(row(n), 1.0), (2 - 2 * math.cos(math.pi / n)) / n) for n in (3, 4, 7)),
-        (connectivity(row(4), 0.5), 0.0),
-        (connectivity(row(1), 0.5), 1.0),
         (safety(NEAR), 2 / 3),  # 0.9 m < 2 * 0.5 m
         (safety(NEAR, collision_radius_m=0.45), 1.0),
         (safety(NEAR[:1]), 1.0),

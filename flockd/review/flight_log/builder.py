@@ -12,7 +12,7 @@ from flockd.review.flight_log.log import SHAPES, FlightLog, shape_of
 from flockd.review.flight_log.metadata import FlightMetadata, LearnedSize
 
 ASSOCIATED_M = 3.0
-"""A track so near to a drone is that drone's, however wrong: no large error of a distance is left out, and none counts
+"""Largest distance between a track and the drone that it is of: so wide that a large error counts as an error, and not
 as a false neighbour."""
 
 
@@ -42,7 +42,7 @@ class FlightLogBuilder:
 
     @property
     def true_path(self) -> tuple[FloatArray, FloatArray]:
-        """Positions (S, N, 3) m and velocities (S, N, 3) m/s NED: of a flight on exact states its own companion."""
+        """True positions (S, N, 3) m and velocities (S, N, 3) m/s NED: the companion of a flight on exact states."""
         return self._rows["position"], self._rows["velocity"]
 
     def add_missions(
@@ -112,7 +112,7 @@ class FlightLogBuilder:
         self._rows["false_tracks"][step, i] = len(false)
 
     def cut(self, steps: int) -> None:
-        """Leaves only the first ``steps`` steps: the flight ended there."""
+        """Keeps only the first ``steps`` steps, of a flight that ended there."""
         self._rows = {name: rows[:steps] for name, rows in self._rows.items()}
         self._tracked = [row for row in self._tracked if row[0] < steps]
 

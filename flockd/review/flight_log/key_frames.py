@@ -45,7 +45,7 @@ class KeyFrame:
         return self.name or f"drone {self.drone + 1}"
 
     def at_half_size(self) -> KeyFrame:
-        """With a quarter of the pixels, as much as a plate shows; maps are thinned, images averaged."""
+        """A copy of half the size, enough for a plate: images are averaged, maps keep every second pixel."""
         return replace(
             self,
             images={
@@ -64,7 +64,7 @@ def _thin(image: NDArray[_Pixel]) -> NDArray[_Pixel]:
 
 
 _KEY_FRAMES, _KEY_FRAMES_APART = 6, 6
-"""In a flight, and at least how many steps apart: each costs a second of the report's time and 0.2 MB of its size."""
+"""Most in a flight, and least steps between two: each costs a second of the report's time and 0.2 MB of its size."""
 _SKY_M = 75.0
 """Estimated depth beyond this is shown as sky."""
 
@@ -76,7 +76,7 @@ def key_frame_steps(steps: int) -> set[int]:
 
 
 def capture(trace: StepTrace, output: PilotOutput, drone: int, name: str = "") -> list[KeyFrame]:
-    """What a pilot worked with in the step that gave ``output`` and ``trace``.
+    """The key frame of the step that gave ``output`` and ``trace``, in a list.
 
     Empty before its first step, and where no camera had a usable image, as of a drone that touched the ground.
     """

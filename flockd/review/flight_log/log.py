@@ -31,20 +31,18 @@ SHAPES: dict[str, tuple[int, ...]] = {
     "truth_position": (_S, _N, 3),
     "truth_velocity": (_S, _N, 3),
 }
-"""Of a log's arrays with a row a step; see `shape_of`."""
+"""Shapes of a log's arrays with a row for each step; `shape_of` puts in the numbers of steps and drones."""
 _STAGE_PREFIX = "stage "
-_LEFT_AWAY = ("goal", "obstacles", "clearance")
-"""From the file, where they are empty."""
-_MAY_BE_EMPTY = (*_LEFT_AWAY, "truth_position", "truth_velocity")
+_MAY_BE_EMPTY = ("goal", "clearance", "truth_position", "truth_velocity")
 
 
 def shape_of(name: str, steps: int, drones: int) -> tuple[int, ...]:
-    """Of an array of `SHAPES` in the log of so many."""
+    """Shape of an array of `SHAPES` in a log of so many steps and drones."""
     return tuple({_S: steps, _N: drones}.get(side, side) for side in SHAPES[name])
 
 
 def spread(samples: FloatArray | Sequence[float], *wanted: str) -> dict[str, float | None]:
-    """Of samples of any shape those of mean, median, p95 and max that are ``wanted``; None where none is finite."""
+    """The ``wanted`` ones of mean, median, p95 and max of the finite samples, by name; None without any."""
     known = np.asarray(samples, float)
     known = known[np.isfinite(known)]
     of: dict[str, Callable[[FloatArray], Any]] = {
@@ -138,9 +136,6 @@ class FlightLog:
         arrays: dict[str, Any] = {
             part.name: getattr(self, part.name) for part in fields(self) if part.name not in ("stages_ms", "metadata")
         }
-        for name in _LEFT_AWAY:
-            if not len(arrays[name]):
-                del arrays[name]
         arrays |= {_STAGE_PREFIX + stage: samples for stage, samples in self.stages_ms.items()}
         with path.open("wb") as file:
             np.savez_compressed(file, **arrays, meta=self.metadata.model_dump_json(exclude_unset=True))

@@ -42,7 +42,7 @@ class FleetMetadata(BaseModel):
 
 
 class HandedOver(BaseModel):
-    """That a simulated drone's supervisor asked for Hold."""
+    """When and why a simulated drone's supervisor asked for Hold."""
 
     model_config = _FROZEN
 
@@ -51,14 +51,15 @@ class HandedOver(BaseModel):
 
 
 class LearnedSize(BaseModel):
-    """What a drone had learned of the others' size when its flight ended."""
+    """The size of the others that a drone knew at the end of its flight, learned in flight."""
 
     model_config = _FROZEN
 
     since_s: float
-    """When it first knew one."""
+    """Time of the flight at which it first knew a size."""
     size_m: float
     sigma: float
+    """Relative standard deviation of `size_m`."""
 
 
 class MissionMetadata(BaseModel):

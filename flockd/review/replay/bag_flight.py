@@ -67,10 +67,11 @@ def recording_of_bag(
     target: Path,
     tell: Callable[[str], None] = lambda sentence: None,
 ) -> int:
-    """Writes a recording of the bag's frame sets, a step every ``config.step_s``; gives their number.
+    """Writes a recording of the bag's frame sets to ``target``, a step every ``config.step_s``; returns their number.
 
-    ``tell`` is called with what of its images could not be used.
-    Topics of the cameras are those of ``config.source``, whose kind is `ros`. Raises UsageError and RecordingError.
+    ``config.source``, of kind `ros`, names the cameras' topics; ``vehicle_topic`` is that of the vehicle's state, None:
+    the only one of the best kind. ``tell`` is called with a sentence about images that could not be used. Raises
+    UsageError and RecordingError.
     """
     source = config.source
     if source is None or source.kind != "ros":
@@ -185,12 +186,12 @@ def _format(
 
 @dataclass(frozen=True)
 class _PngFormat:
-    """The format is right whatever the image shows."""
+    """PNG images of a camera's size; whether one is whole shows when it is decoded."""
 
     size: tuple[int, int]
 
     def check(self, data: bytes) -> None:
-        """Nothing: decoding tells."""
+        """See ``ImageFormat``; nothing is checked before decoding."""
 
     def pixels(self, data: bytes) -> UInt8Array:
         """See ``ImageFormat``."""
@@ -207,7 +208,7 @@ class _PngFormat:
 
 
 def _states(bag: Bag, topic: str, config: DroneConfig, began_ns: int, tell: Callable[[str], None]) -> NearestState:
-    """All of the bag."""
+    """All states of the vehicle in the bag."""
     check_height(f"{bag.path}: {topic}", bag.kinds()[topic], config)
     states, on_arrival = NearestState(kept=None), False
     for message in bag.messages([topic]):
@@ -223,7 +224,7 @@ def _states(bag: Bag, topic: str, config: DroneConfig, began_ns: int, tell: Call
 
 
 def _vehicle_topic(bag: Bag, wanted: str | None) -> str:
-    """The topic that is named, or the only one of the best kind there is. Raises UsageError."""
+    """The topic that is named, or the only one of the best kind in the bag. Raises UsageError."""
     kinds = bag.kinds()
     if wanted is not None:
         if kinds.get(wanted) not in STATES:
@@ -265,7 +266,7 @@ METADATA = "metadata.yaml"
 
 
 def is_bag(path: Path) -> bool:
-    """Whether it is the folder of a bag."""
+    """Whether a path is the folder of a bag."""
     return (path / METADATA).is_file()
 
 
@@ -280,7 +281,7 @@ class BagMessage(NamedTuple):
 
 
 class Bag:
-    """A bag that is read. Raises RecordingError for what is none, and ModuleNotFoundError without `rosbags`."""
+    """A bag, open for reading. Raises RecordingError for an unreadable one, ModuleNotFoundError without `rosbags`."""
 
     def __init__(self, folder: Path) -> None:
         from rosbags.rosbag2 import Reader, ReaderError  # noqa: PLC0415 - of an extra
@@ -311,7 +312,7 @@ class Bag:
         return {one.topic: one.msgtype for one in self._reader.connections}
 
     def messages(self, topics: Collection[str]) -> Iterator[BagMessage]:
-        """Of these topics, in the order of their times. Raises RecordingError where it is damaged."""
+        """The messages of these topics in order of time. Raises RecordingError where the bag is damaged."""
         wanted = [one for one in self._reader.connections if one.topic in topics]
         if not wanted:
             return
@@ -324,7 +325,7 @@ class Bag:
             raise RecordingError(f"{self.path}: cannot be read to its end ({error}); use another copy") from error
 
     def read(self, message: BagMessage) -> Any:
-        """A message's fields as attributes, of the standard types. Raises RecordingError."""
+        """The message with its fields as attributes. Raises RecordingError if it cannot be read."""
         try:
             return self._store.deserialize_cdr(message.data, message.kind)
         except Exception as error:  # of generated code: struct.error, UnicodeDecodeError and others

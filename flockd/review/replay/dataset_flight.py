@@ -118,7 +118,7 @@ class Pair:
 
 
 class RecordedDepth(OneByOne):
-    """The learned perception, with the recorded depth in place of the network's."""
+    """The networks' perception, with the recorded depth in place of theirs."""
 
     def __init__(self, learned: OneByOne) -> None:
         self.second_stage = learned.second_stage
@@ -127,20 +127,20 @@ class RecordedDepth(OneByOne):
         self._depth: ZMap | None = None
 
     def show(self, depth: ZMap | None) -> None:
-        """The depth of the next step's image; None: what is learned."""
+        """Sets the depth of the next step's image; None: the network's depth is used."""
         self._depth = depth
 
     def flow(self, first: Frame, second: Frame, labels: UInt8Array) -> Float32Array:
-        """The learned flow."""
+        """The network's flow."""
         return self._learned.flow(first, second, labels)
 
     def scene(self, frame: Frame, camera: RigCamera, ground: Float32Array | None) -> SceneMaps:
-        """The learned drones, and the recorded depth."""
+        """The network's drones, and the recorded depth."""
         scene = self._learned.scene(frame, camera, ground)
         return scene if self._depth is None else replace(scene, depth=self._depth)
 
     def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
-        """The learned ranges."""
+        """The network's ranges."""
         return self._learned.ranges(crops)
 
 

@@ -17,7 +17,7 @@ from flockd.onboard.recording.mcap_file import RecordingError
 Outputs = Mapping[int, Mapping[str, Any]]
 """`PilotOutput`s as JSON, by the number of the step."""
 NOT_COMPARED = ("stages_ms",)
-"""Durations, which are no part of the result."""
+"""Fields that are not compared: durations."""
 ABSENT = "nothing"
 
 
@@ -41,7 +41,7 @@ class Difference:
 
 @dataclass
 class FieldDifference:
-    """One field over all steps, whatever stands in its brackets."""
+    """The differences of one field over all steps and all its indices."""
 
     steps: set[int] = field(default_factory=set)
     largest: float | None = 0.0
@@ -50,7 +50,7 @@ class FieldDifference:
 
 @dataclass
 class Comparison:
-    """What comparing two sets of outputs found."""
+    """The result of comparing two sets of outputs."""
 
     steps: int
     values: int

@@ -37,7 +37,7 @@ _EIGHT_BIT = {
 
 @dataclass(frozen=True)
 class ComputerFiles:
-    """Files in which the kernel says what the computer is, and its present state."""
+    """Files of the kernel that describe the computer and its present state."""
 
     cpuinfo: Path = Path("/proc/cpuinfo")
     board: Path = Path("/proc/device-tree/model")
@@ -45,7 +45,7 @@ class ComputerFiles:
     thermal: Path = THERMAL_ZONES
 
     def computer(self) -> dict[str, Any]:
-        """What it is: board or processor, cores for this process, instructions, memory (None: not told)."""
+        """Board or processor, cores of this process, 8-bit instructions, and memory in MB (None: unknown)."""
         facts, total = _facts(self.cpuinfo), _facts(self.meminfo).get("MemTotal")
         flags = (facts.get("flags") or facts.get("Features") or "").split()
         board = _text(self.board).strip("\0\n ")
@@ -59,7 +59,7 @@ class ComputerFiles:
 
 
 class Watch:
-    """Notes how the computer does while a replay goes on."""
+    """Notes temperatures and throttling of the computer during a replay."""
 
     def __init__(self, kernel: ComputerFiles | None = None) -> None:
         self.kernel = kernel or ComputerFiles()
@@ -69,14 +69,14 @@ class Watch:
         self.look()
 
     def look(self) -> None:
-        """Once a step."""
+        """Reads both; called once a step."""
         zones = dict(thermal_zones(self.kernel.thermal))
         self._temperatures_c += [max(zones.values())] if zones else []
         self._slowed.update(processors_slowed(self.kernel.thermal))
 
     def summary(self) -> dict[str, Any]:
-        """Processes that wanted a core before it began (the average of a minute); temperatures in °C at the start, at
-        most and at the end; what slowed the processor. None: not told.
+        """As JSON: the load of the minute before the replay; temperatures in °C at the start, at most and at the end
+        (None: unknown); and the names of what slowed the processor.
         """
         hot = self._temperatures_c
         return {
@@ -87,9 +87,10 @@ class Watch:
 
 
 def profile_result(replay: Replay, config: DroneConfig, watch: Watch) -> dict[str, Any]:
-    """As JSON: the computer, what decides how long a step takes, and where time went in the steps after the first,
-    which has no images before it, and warms up. `least_step_s` leaves a fifth for what else the drone's computer does.
-    Of a replay of `LEAST_STEPS` or more.
+    """As JSON: the computer, the settings that decide how long a step takes, and the time of each stage.
+
+    The first step is left out, as it has no images before it and warms up. `least_step_s` leaves a fifth of the time
+    for the other work of a drone's computer. The replay has `LEAST_STEPS` or more.
     """
     steps_ms, processor_ms = replay.steps_ms[1:], replay.processor_ms[1:]
     samples = {stage: ms[-len(steps_ms) :] for stage, ms in replay.stages_ms.items()}
@@ -125,7 +126,7 @@ def profile_result(replay: Replay, config: DroneConfig, watch: Watch) -> dict[st
 
 
 def _facts(file: Path) -> dict[str, str]:
-    """The first value of each key: one processor speaks for all."""
+    """The first value of each key: all processors are taken to be alike."""
     facts: dict[str, str] = {}
     for line in _text(file).splitlines():
         key, colon, value = line.partition(":")

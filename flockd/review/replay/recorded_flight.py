@@ -17,7 +17,7 @@ from flockd.flight.pilot import FlockPilot
 from flockd.onboard.daemon import load_side_by_side
 from flockd.onboard.message_json import to_json
 from flockd.onboard.recording import Recorder, RecordingError
-from flockd.onboard.recording.reader import RecordedStep, Recording
+from flockd.onboard.recording.reader import Recording
 from flockd.onboard.recording.streams import REPLAYED
 from flockd.review.flight_log.log import spread
 from flockd.review.replay.difference import Comparison, compare
@@ -34,9 +34,8 @@ class Replay:
     recorded: dict[int, Mapping[str, Any]] = field(default_factory=dict)
     times_s: list[float] = field(default_factory=list)
     """Time of each step's frames."""
-    reading_s: float = 0.0
     steps_ms: list[float] = field(default_factory=list)
-    """What each step took."""
+    """Real time of each step."""
     processor_ms: list[float] = field(default_factory=list)
     """Processor time of each, all threads together."""
     stages_ms: dict[str, list[float]] = field(default_factory=dict)
@@ -68,12 +67,11 @@ def replay_flight(
     replay = Replay()
     with ExitStack() as stack:
         recorder = None if out is None else stack.enter_context(_recording_to(out, recording, config))
-        for step, read_s in _timed(recording.steps(start_s, end_s)):
+        for step in recording.steps(start_s, end_s):
             begin_s, processor_begin_s = time.perf_counter(), time.process_time()
             output = pilot.step(step.frames, step.vehicle, order=step.order)
             replay.steps_ms.append(1e3 * (time.perf_counter() - begin_s))
             replay.processor_ms.append(1e3 * (time.process_time() - processor_begin_s))
-            replay.reading_s += read_s
             replay.times_s.append(step.frames.time_s)
             replay.outputs[step.number] = to_json(output)
             if step.output is not None:
@@ -106,14 +104,12 @@ def replay_result(
 ) -> dict[str, Any]:
     """The result of a replay as JSON, for `flockd replay --json`."""
     duration_s = replay.times_s[-1] - replay.times_s[0]
-    spent_s = replay.reading_s + sum(replay.steps_ms) / 1e3
     return {
         "recording": str(recording.path),
         "drone": recording.drone,
         "steps": len(replay.outputs),
         "duration_s": duration_s,
-        "realtime_factor": duration_s / spent_s,
-        "reading_share": replay.reading_s / spent_s,
+        "realtime_factor": duration_s / (sum(replay.steps_ms) / 1e3),
         "stages_ms": {stage: spread(samples, "median", "p95") for stage, samples in replay.stages_ms.items()},
         "warnings": list(warnings),
         "diff": None if comparison is None else _diff(comparison),
@@ -135,7 +131,7 @@ def _diff(comparison: Comparison) -> dict[str, Any]:
 
 @contextmanager
 def _recording_to(out: Path, recording: Recording, config: DroneConfig) -> Iterator[Recorder]:
-    """A recorder whose file exists once all is written, and not otherwise: one file, without loss or quota."""
+    """A recorder of one file without loss or quota. The file exists only once all of it is written."""
     settings = RecordingConfig(images="png", quota_mb=1e12)
     flown = recording.contents.flight
     facts = {**{name: flown[name] for name in ("scenario", "seed") if name in flown}, REPLAYED: recording.path.name}
@@ -153,14 +149,6 @@ def _recording_to(out: Path, recording: Recording, config: DroneConfig) -> Itera
             yield recorder
         if recorder.failure is not None:
             raise RecordingError(f"{out}: could not be written ({recorder.failure}); choose another place with --out")
-
-
-def _timed(steps: Iterator[RecordedStep]) -> Iterator[tuple[RecordedStep, float]]:
-    """Each step, with how long it took to read."""
-    begin_s = time.perf_counter()
-    for step in steps:
-        yield step, time.perf_counter() - begin_s
-        begin_s = time.perf_counter()
 
 
 def damage_warnings(recording: Recording) -> Iterator[str]:

@@ -13,21 +13,17 @@ from matplotlib import colormaps
 from matplotlib.colors import LogNorm, hsv_to_rgb
 from numpy.typing import NDArray
 
-from flockd.core.messages import BoolArray, UInt8Array
+from flockd.core.messages import BoolArray, FloatArray, UInt8Array
 from flockd.review.flight_log.key_frames import KeyFrame
-from flockd.review.report.style import (
-    FEW,
-    PLATE,
-    PLATE_INK,
-    PLATE_MUTED,
-    colour_of,
-    line,
-    rgb,
-    rig_place,
-    width_of,
-    write,
-)
+from flockd.review.report.style import FEW, colour_of
 
+_RIG_ORDER = ("left", "front", "right", "back")
+"""Reading order of the cameras: a turn to the right. Cameras of other names follow in their own order."""
+_PLATE, _INK, _MUTED = "#14181f", "#e8ecf1", "#98a3b0"
+"""As dark as film under either scheme of the page, so that the images appear alike in both."""
+_FONT = cv2.FONT_HERSHEY_SIMPLEX
+_SHIFT = 4
+"""Fractional bits of the pixels that OpenCV draws at."""
 _DEPTH_NORM = LogNorm(1.0, 50.0)
 _DEPTH_COLOURS = colormaps["magma_r"].with_extremes(bad="#26303d")
 _DEPTH_TICKS_M = (1, 2, 5, 10, 20, 50)
@@ -74,16 +70,16 @@ def load_plates(path: Path) -> list[Plate]:
 
 def filmstrip(frame: KeyFrame) -> UInt8Array:
     """(h, w, 3) RGB of one moment: a row of camera images with the drones found in them, one of depth, one of flow."""
-    cameras = sorted(frame.cameras, key=rig_place)
+    cameras = sorted(frame.cameras, key=_rig_place)
     across = min((_WIDTH - _LEFT - _RIGHT - _GAP * (len(cameras) - 1)) // len(cameras), _WIDEST)
     down = round(across * max(image.shape[0] / image.shape[1] for image in frame.images.values()))
     key = _LEFT + len(cameras) * (across + _GAP)
-    plate = np.full((_TOP + _BOTTOM + 3 * (down + _GAP) - _GAP, key + _RIGHT - _GAP, 3), rgb(PLATE), np.uint8)
-    write(plate, _LEFT, 40, f"{frame.title}, t = {frame.time_s:.1f} s", 0.9, PLATE_INK)
+    plate = np.full((_TOP + _BOTTOM + 3 * (down + _GAP) - _GAP, key + _RIGHT - _GAP, 3), _rgb(_PLATE), np.uint8)
+    write(plate, _LEFT, 40, f"{frame.title}, t = {frame.time_s:.1f} s", 0.9, _INK)
     tops = [_TOP + row * (down + _GAP) for row in range(3)]
     for top, name in zip(tops, ("image", "depth", "flow"), strict=True):
-        aside = np.full((_LEFT - _GAP, down, 3), rgb(PLATE), np.uint8)
-        write(aside, (down - width_of(name, 0.6)) / 2, 26, name, 0.6, PLATE_MUTED)
+        aside = np.full((_LEFT - _GAP, down, 3), _rgb(_PLATE), np.uint8)
+        write(aside, (down - _width_of(name, 0.6)) / 2, 26, name, 0.6, _MUTED)
         plate[top : top + down, : _LEFT - _GAP] = np.rot90(aside)
     p95_px = _typical_flow(frame)
     for column, camera in enumerate(cameras):
@@ -98,7 +94,7 @@ def filmstrip(frame: KeyFrame) -> UInt8Array:
         cells = [_seen(frame, camera, masks, size)]
         cells.append(_depth(frame.depth[camera], size) if camera in frame.depth else cells[0][:0])
         cells.append(_flow(frame, camera, masks, size, p95_px) if camera in frame.flow else cells[0][:0])
-        write(plate, left, tops[0] + (down - size[1]) // 2 - 10, camera, 0.6, PLATE_MUTED)
+        write(plate, left, tops[0] + (down - size[1]) // 2 - 10, camera, 0.6, _MUTED)
         for top, cell in zip(tops, cells, strict=True):
             upper = top + (down - len(cell)) // 2
             plate[upper : upper + len(cell), left : left + across] = cell
@@ -114,7 +110,7 @@ def _seen(frame: KeyFrame, camera: str, masks: dict[int, BoolArray], size: tuple
     taken: list[tuple[float, float]] = []
     for label, mask in masks.items():
         colour = colour_of(frame.track_ids[label], FEW) if label in frame.track_ids else "#ffffff"
-        image[mask] = (0.55 * image[mask] + 0.45 * np.array(rgb(colour))).astype(np.uint8)
+        image[mask] = (0.55 * image[mask] + 0.45 * np.array(_rgb(colour))).astype(np.uint8)
         _outline(image, mask, colour)
         track = f"#{frame.track_ids[label]}" if label in frame.track_ids else "new"
         _name(image, mask, f"{track}  {frame.ranges[label]:.2f} m" if label in frame.ranges else track, taken)
@@ -123,13 +119,13 @@ def _seen(frame: KeyFrame, camera: str, masks: dict[int, BoolArray], size: tuple
 
 def _outline(image: UInt8Array, mask: BoolArray, colour: str) -> None:
     for contour in cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]:
-        cv2.polylines(image, [contour], True, rgb(colour), 1, cv2.LINE_AA)
+        cv2.polylines(image, [contour], True, _rgb(colour), 1, cv2.LINE_AA)
 
 
 def _name(image: UInt8Array, mask: BoolArray, caption: str, taken: list[tuple[float, float]]) -> None:
-    """Written as near to the drone as there is room, within the image and on lines that no name nearby has."""
+    """Writes a caption as near to the drone as possible, within the image and off the lines of captions nearby."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    wide, high = width_of(caption, 0.5), 18
+    wide, high = _width_of(caption, 0.5), 18
     left = float(np.clip((columns[0] + columns[-1] - wide) / 2, 0, max(image.shape[1] - wide, 0)))
     bases = [float(rows[0] - 6), float(rows[-1] + high)]
     bases += [rows[0] - 6 - n * high for n in (1, 2)] + [rows[-1] + n * high for n in (2, 3)]
@@ -173,8 +169,8 @@ def _arrow(cell: UInt8Array, start: NDArray[np.floating], along: NDArray[np.floa
     colour = "#{:02x}{:02x}{:02x}".format(*(255 * _direction_colours(*along)).astype(int))
     tip, back = start + along, along / length * min(3.0 * thick + 2.0, length)
     across = 0.5 * np.array([-back[1], back[0]])
-    line(cell, np.stack([start, tip]), colour, thick)
-    line(cell, np.stack([tip - back + across, tip, tip - back - across]), colour, thick)
+    _line(cell, np.stack([start, tip]), colour, thick)
+    _line(cell, np.stack([tip - back + across, tip, tip - back - across]), colour, thick)
 
 
 def _typical_flow(frame: KeyFrame) -> float:
@@ -196,14 +192,43 @@ def _draw_depth_key(plate: UInt8Array, left: int, top: int, height: int) -> None
     plate[top : top + height, left : left + 19] = _depth(np.geomspace(50.0, 1.0, height)[:, None], (19, height))
     for depth_m in _DEPTH_TICKS_M:
         middle = top + (1.0 - float(_DEPTH_NORM(depth_m))) * height
-        write(plate, left + 27, np.clip(middle + 6, top + 12, top + height), f"{depth_m} m", 0.5, PLATE_INK)
+        write(plate, left + 27, np.clip(middle + 6, top + 12, top + height), f"{depth_m} m", 0.5, _INK)
 
 
 def _draw_flow_key(plate: UInt8Array, left: int, top: int, p95_px: float) -> None:
     """A wheel of directions and how long the arrows are."""
     x, y = np.meshgrid(np.linspace(-1, 1, 80), np.linspace(-1, 1, 80))
     opacity = np.clip(40 * np.minimum(1 - np.hypot(x, y), np.hypot(x, y) - 0.45), 0, 1)[..., None]
-    wheel = opacity * 255 * _direction_colours(x, y) + (1 - opacity) * np.array(rgb(PLATE))
+    wheel = opacity * 255 * _direction_colours(x, y) + (1 - opacity) * np.array(_rgb(_PLATE))
     plate[top : top + 80, left + 18 : left + 98] = wheel
     for row, text in enumerate(("95 % under", f"{p95_px:.1f} px")):
-        write(plate, left + 58 - width_of(text, 0.5) / 2, top + 102 + 20 * row, text, 0.5, PLATE_INK)
+        write(plate, left + 58 - _width_of(text, 0.5) / 2, top + 102 + 20 * row, text, 0.5, _INK)
+
+
+def _rig_place(camera: str) -> int:
+    """A camera's place in the reading order."""
+    return _RIG_ORDER.index(camera) if camera in _RIG_ORDER else len(_RIG_ORDER)
+
+
+def _rgb(colour: str) -> tuple[int, int, int]:
+    """Red, green and blue of a colour such as `#0072b2`."""
+    return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
+
+
+def _line(image: UInt8Array, pixels: FloatArray, colour: str, thick: int) -> None:
+    """Draws a line through pixels (n, 2), whose centres are at +0.5."""
+    fixed = np.round((pixels - 0.5) * (1 << _SHIFT)).astype(np.int32)  # as OpenCV wants them with a shift
+    cv2.polylines(image, [fixed], False, _rgb(colour), thick, cv2.LINE_AA, _SHIFT)
+
+
+def _width_of(text: str, size: float) -> int:
+    """Width of a text in pixels."""
+    return int(cv2.getTextSize(text, _FONT, size, 1)[0][0])
+
+
+def write(image: UInt8Array, left: float, base: float, text: str, size: float, colour: str = "#ffffff") -> None:
+    """Writes a text, ASCII alone, with a dark rim; ``left`` and ``base`` are pixels of its lower left corner."""
+    shown, (x, y) = text.encode("ascii", "replace").decode(), (round(left), round(base))
+    for across, down in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+        cv2.putText(image, shown, (x + across, y + down), _FONT, size, (0, 0, 0), 1, cv2.LINE_AA)
+    cv2.putText(image, shown, (x, y), _FONT, size, _rgb(colour), 1, cv2.LINE_AA)

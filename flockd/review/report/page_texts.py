@@ -222,7 +222,6 @@ _FLOCK = {
     "min_distance_after_10s_m": ("smallest distance in 3D after 10 s, m", 3),
     "order_tail": ("order, last 10 s", 4),
     "union_tail": ("union, last 10 s", 4),
-    "connectivity_tail": ("connectivity, last 10 s", 4),
     "safety": ("safety", 4),
 }
 _NEIGHBOURS = {

@@ -7,15 +7,11 @@ import re
 from pathlib import Path
 from typing import Any, Final
 
-import cv2
 import jinja2
-import numpy as np
 from matplotlib import colormaps, rc_context
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-
-from flockd.core.messages import FloatArray, UInt8Array
 
 FEW: Final = 8
 """Up to this many drones have a line and a colour each; more are shown as the band they fill."""
@@ -84,46 +80,6 @@ def colour_of(number: int, count: int) -> str:
 def drone_handles(drones: int) -> list[Line2D]:
     """Of a legend: each drone's line. Drones count from 0 in the log and from 1 in the report, as in the paper."""
     return [Line2D([], [], color=colour_of(i, drones), label=f"drone {i + 1}") for i in range(drones)]
-
-
-RIG_ORDER = ("left", "front", "right", "back")
-"""Reading order of the cameras: a turn to the right. Cameras of other names follow in their own order."""
-PLATE, PLATE_INK, PLATE_MUTED = "#14181f", "#e8ecf1", "#98a3b0"
-"""As dark as film under either scheme of the page, so that the images appear alike in both."""
-FONT = cv2.FONT_HERSHEY_SIMPLEX
-_SHIFT = 4
-"""Fractional bits of the pixels that OpenCV draws at."""
-Colour = tuple[int, int, int]
-"""RGB."""
-
-
-def rig_place(camera: str) -> int:
-    """Its place in the reading order."""
-    return RIG_ORDER.index(camera) if camera in RIG_ORDER else len(RIG_ORDER)
-
-
-def rgb(colour: str) -> Colour:
-    """Of a colour as in `#0072b2`."""
-    return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
-
-
-def line(image: UInt8Array, pixels: FloatArray, colour: str, thick: int) -> None:
-    """Through (n, 2) pixels, whose middles are at halves."""
-    fixed = np.round((pixels - 0.5) * (1 << _SHIFT)).astype(np.int32)  # as OpenCV wants them with a shift
-    cv2.polylines(image, [fixed], False, rgb(colour), thick, cv2.LINE_AA, _SHIFT)
-
-
-def width_of(text: str, size: float) -> int:
-    """Pixels."""
-    return int(cv2.getTextSize(text, FONT, size, 1)[0][0])
-
-
-def write(image: UInt8Array, left: float, base: float, text: str, size: float, colour: str = "#ffffff") -> None:
-    """With a dark rim, to be read on anything. The font has ASCII alone; the place is that of the lower left corner."""
-    shown, (x, y) = text.encode("ascii", "replace").decode(), (round(left), round(base))
-    for across, down in ((-1, 0), (1, 0), (0, -1), (0, 1)):
-        cv2.putText(image, shown, (x + across, y + down), FONT, size, (0, 0, 0), 1, cv2.LINE_AA)
-    cv2.putText(image, shown, (x, y), FONT, size, rgb(colour), 1, cv2.LINE_AA)
 
 
 # What the page's style sheet turns with the reader's light or dark scheme.

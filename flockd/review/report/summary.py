@@ -11,7 +11,7 @@ from flockd.core.config.flocking import FlockingParameters
 from flockd.core.messages import BoolArray, FloatArray
 from flockd.review.flight_log.builder import ASSOCIATED_M, match_neighbours
 from flockd.review.flight_log.log import FlightLog, spread
-from flockd.review.metrics import closest_distances, connectivity, obj1, obj2, order, safety, union
+from flockd.review.metrics import closest_distances, obj1, obj2, order, safety, union
 
 TAIL_S = 10.0
 """The end of a flight, over which the flock counts as converged."""
@@ -33,8 +33,8 @@ def summarise(log: FlightLog) -> Json:
     `table2`: absolute errors over all drones, steps and seen neighbours, before and from `circle_until_s`. `table3`:
     convergence of the companion with exact states ("truth") and of this flight ("vision"), null unless the flight goes
     on for 10 s after the circle. `flock`: the smallest distances between drone centres in three dimensions, between
-    steps too (`closest_distances`), and `safety` at all steps; order (null of a flock that hovers), union and
-    connectivity are horizontal means over the last 10 s, with the law's observation distance as interaction distance.
+    steps too (`closest_distances`), and `safety` at all steps; order (null of a flock that hovers) and union are
+    horizontal means over the last 10 s, with the law's observation distance as interaction distance.
     `neighbours`: the share of all drones within 10 m, at all steps, of which there was a confirmed track, new false
     tracks, how much of the time a drone has one, and errors of the distances of all tracks within 3 m of a drone, one
     to one; of drones and steps that were recorded. A flight whose perception is "truth" has no perception:
@@ -241,7 +241,7 @@ def _convergence(
     }
 
 
-_FLOCK = ("min_distance_m", "min_distance_after_10s_m", "order_tail", "union_tail", "connectivity_tail", "safety")
+_FLOCK = ("min_distance_m", "min_distance_after_10s_m", "order_tail", "union_tail", "safety")
 
 
 def _flock(log: FlightLog) -> Json:
@@ -258,7 +258,6 @@ def _flock(log: FlightLog) -> Json:
         "min_distance_after_10s_m": _finite(nearest[log.time_s >= 10.0].min(initial=np.inf)),
         "order_tail": None if hovers else _mean([order(log.velocity[s, :, :2]) for s in tail]),
         "union_tail": _mean([union(log.position[s, :, :2], reach_m) for s in tail]),
-        "connectivity_tail": _mean([connectivity(log.position[s, :, :2], reach_m) for s in tail]),
         "safety": _mean([safety(log.position[s]) for s in steps]),
     }
 

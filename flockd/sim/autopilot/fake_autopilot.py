@@ -1,8 +1,8 @@
 """A fake autopilot for tests, and for the simulator where there is no PX4. It is not PX4 and flies nothing real.
 
-It speaks real MAVLink over UDP and keeps PX4's rules where flockd depends on them. These are: who may enter offboard,
-when it is lost and what follows; PX4 returns to offboard by itself when setpoints come back; the heartbeat comes once a
-second only. Where PX4 does more (climbing before a return, position control in Hold, estimators) it does not try.
+It speaks MAVLink over UDP and follows PX4's rules where flockd depends on them: when offboard may be entered, when it
+is lost and which failsafe follows, that PX4 returns to offboard when setpoints come back, and that a heartbeat comes
+once a second. It does not simulate what else PX4 does: climbing before a return, position control in Hold, estimators.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ TICK_S = 0.02
 MAX_STEP_S = 0.2
 """Over a longer pause of this computer the vehicle is taken to have stood still."""
 TYPE_MASK = 2503
-"""The one kind of setpoint it takes: velocity and yaw."""
+"""Type mask of the only setpoint that it accepts: velocity and yaw."""
 DISARM_AFTER_LANDING_S = 2.0
 ARRIVED_M = 0.3
 STICKS_FRESH_S = 0.5
@@ -87,14 +87,14 @@ class FakeAutopilot:
         range_finder: FakeRangeFinder | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Bind a socket; nothing is sent before `start`.
+        """Binds a socket; nothing is sent before `start`.
 
         Args:
             port: of this computer, where a companion computer listens.
             system_id: its MAV_SYS_ID.
             height_m: in Hold at this height; 0: on the ground.
             yaw_rad: heading, radians clockwise from north.
-            motion: flies it instead of a level `Flown`, in metres from its home.
+            motion: moves the vehicle, in metres from its home; None: a `Flown` that stays level.
             heartbeat_s: between two; a second is PX4's.
             home_deg: latitude and longitude of where it begins.
             truth_port: where a simulator listens: it gets the true pose, as PX4 in software
@@ -110,7 +110,7 @@ class FakeAutopilot:
         self.frame_off, self.heading_off_rad = np.zeros(3), 0.0
         """How far its positions (3,) in NED and its heading deviate from the truth, in metres and clockwise."""
         self.drifts, self.drift = True, EstimateErrors(SensorConfig(), seed=system_id, drone=0)
-        # `drifts`, False: its estimate is the truth. It is at first.
+        # Whether its estimate drifts in flight, and how far it deviates from the truth: at first not at all.
         self.drift.velocity, self.drift.position = np.zeros(3), np.zeros(2)
         self.failing: set[str] = set()
         """PX4's names of further checks that fail; each refuses to arm."""
@@ -226,7 +226,7 @@ class FakeAutopilot:
             self.streams = self._new_streams(started_s=-self.clock_offset_s)
 
     def send_from_elsewhere(self, data: bytes) -> None:
-        """Passes it a packet of another program, as on another of its links."""
+        """Gives it a packet as if another program had sent it on another link."""
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
             sender.sendto(data, self._socket.getsockname())
 

@@ -1,4 +1,4 @@
-"""The fake autopilot's checks before a flight, told as PX4 does: by MAVLink events, at each change and when asked."""
+"""The fake autopilot's checks before a flight, sent as PX4 does: as MAVLink events, at each change and on request."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ BOOT_MS = 0
 
 
 class FakeChecks:
-    """What the fake tells of PX4's checks, by their names, and of requests that it refuses."""
+    """Sends the results of PX4's checks, by their names, and the requests that were refused."""
 
     def __init__(self, link: mavlink.MAVLink) -> None:
         self._mav = link
@@ -57,7 +57,7 @@ class FakeChecks:
             self.tell(failing)
 
     def tell(self, failing: Iterable[str]) -> None:
-        """Sends the list: of missing setpoints for offboard alone, of all else for every mode."""
+        """Sends the failing checks: missing setpoints fail offboard alone, all others every mode."""
         self._told = frozenset(failing)
         others = self._told - {NO_SETPOINTS}
         may_fly = 0 if others else ALL_MODES & ~(OFFBOARD_BIT if self._told else 0)

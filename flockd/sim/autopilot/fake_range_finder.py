@@ -1,4 +1,4 @@
-"""A simulated range finder that faces down: what it says of a ground of known shape, with its errors."""
+"""A simulated range finder that faces down, over a ground of known shape, with the errors of a real one."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def level_ground(north: FloatArray, east: FloatArray) -> FloatArray:
 
 
 class FakeRangeFinder:
-    """Measures along the body's down axis, but for how it is mounted. All errors come from the seed."""
+    """Measures along the body's down axis, off by its mounting error. All errors come from the seed."""
 
     def __init__(self, config: RangeFinderConfig, ground: Ground, seed: tuple[int, ...]) -> None:
         self._config, self._ground = config, ground

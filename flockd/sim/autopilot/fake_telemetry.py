@@ -1,10 +1,10 @@
-"""What the fake autopilot sends over MAVLink, and when."""
+"""The fake autopilot's MAVLink messages, and when it sends them."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 from pymavlink import mavutil
@@ -188,12 +188,11 @@ def _wxyz(R_ned_body: FloatArray) -> list[float]:
 
 
 def custom_mode(mode: Mode) -> int:
-    """As PX4 numbers it in MAVLink."""
+    """PX4's number of a mode in MAVLink."""
     _, main, sub = mavutil.px4_map[mode]
     return int(main << 16 | sub << 24)
 
 
 def mode_by_number(main: int, sub: int) -> Mode | None:
     """The mode of PX4's numbers; None for one that the fake does not fly."""
-    modes: tuple[Mode, ...] = ("POSCTL", "LOITER", "TAKEOFF", "LAND", "RTL", "ACRO", "OFFBOARD")
-    return next((mode for mode in modes if mavutil.px4_map[mode][1:] == (main, sub)), None)
+    return next((mode for mode in get_args(Mode) if mavutil.px4_map[mode][1:] == (main, sub)), None)

@@ -1,4 +1,4 @@
-"""The vehicle under the fake autopilot, a point mass or whatever else moves to a demand, and its pilot's sticks."""
+"""The vehicle of the fake autopilot, and the sticks of its pilot."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Demand:
 
 @dataclass(frozen=True, eq=False)
 class Asked:
-    """What a setpoint asks for."""
+    """A setpoint."""
 
     velocity: FloatArray
     """(2,) m/s, north and east."""
@@ -37,7 +37,7 @@ class Asked:
 
 @dataclass(frozen=True, eq=False)
 class MotionState:
-    """Where the vehicle is, in NED with the ground at 0."""
+    """The true state of the vehicle, NED with the ground at 0."""
 
     position: FloatArray
     """(3,) metres."""
@@ -83,7 +83,7 @@ class Flown:
 STICK_EXPO = 0.6
 """How much of a stick's curve is cubic, as PX4 1.18 has it and MPC_XY_MAN_EXPO before: slow near the middle."""
 OVERRIDE_FILTER_S, OVERRIDE_SAMPLES = 0.05, 3
-"""Of the sticks' speed, and for how many positions on end it has to have one sign."""
+"""Time constant of the low pass on the sticks' speed, and in how many positions in a row the speed has one sign."""
 
 
 def stick_curve(sticks: FloatArray, deadzone: float = 0.0) -> FloatArray:

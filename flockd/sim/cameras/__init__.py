@@ -1,1 +1,1 @@
-"""What real cameras make of ideal views: shutter, shake, flare, noise, compression, timing."""
+"""Real cameras: shutter, shake, flare, noise, compression and timing applied to ideal views."""

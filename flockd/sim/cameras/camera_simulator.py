@@ -29,7 +29,7 @@ from flockd.sim.world.world import World
 
 
 def true_rigs(scenario: ScenarioConfig) -> list[Rig]:
-    """Of each drone."""
+    """The rig of each drone as it is really mounted, with the scenario's calibration errors."""
     configured = build_rig(scenario.drone.rig)
     errors = None if scenario.camera_faults is None else scenario.camera_faults.rig
     if errors is None:
@@ -57,7 +57,7 @@ def _direction(rng: np.random.Generator) -> FloatArray:
 
 
 def family_of(scenario: ScenarioConfig) -> int:
-    """Which mesh the drones of a flight wear."""
+    """The family, from 0, of the meshes of a flight's drones."""
     wanted = scenario.world.drone_family
     return int(np.random.default_rng([scenario.seed, 1]).integers(FAMILIES)) if wanted == "any" else wanted
 
@@ -96,7 +96,7 @@ class CameraSimulator:
         self._executor = ThreadPoolExecutor(count, thread_name_prefix="camera") if count else None
 
     def begin_again(self) -> None:
-        """For another flight from the beginning in the same world."""
+        """Resets noise, clocks and poses for another flight in the same world."""
         scenario, self._real = self._scenario, None
         self._noise = ImageNoise(self._image_noise, scenario.seed)
         self._captured, self._began_s = PoseTrail(), math.nan
@@ -112,10 +112,10 @@ class CameraSimulator:
         self, drone: int, step: int, time_s: float, vehicles: FlockPose | Vehicles, trail: PoseTrail | None = None,
         disturbed: Disturbances = UNDISTURBED,
     ) -> FrameSet:  # fmt: skip
-        """The frame set of one drone.
+        """The frame set of one drone, from 0, at a step.
 
-        ``trail`` holds where the flock was until then, for what is late and for motion; None: what was captured before
-        is taken, so that a flock's motion between two captures is even.
+        ``trail``: the flock's poses until now, for late images and for motion; None: the poses of earlier captures,
+        between which motion is taken as even. ``disturbed``: cameras that are off and drones that were removed.
         """
         if trail is None:
             trail = self._captured
@@ -196,14 +196,14 @@ def field_grid(extent_m: float) -> FloatArray:
 
 
 class ImageNoise:
-    """Noise that differs from image to image."""
+    """Normal noise of ``sigma`` grey levels, different in each image."""
 
     def __init__(self, sigma: float, seed: int) -> None:
         self._rng = np.random.default_rng([seed, 2])
         self._tile = NoiseTile(self._rng, sigma) if sigma > 0 else None
 
     def add(self, image: UInt8Array) -> UInt8Array:
-        """The image (h, w, 3) with it."""
+        """The image (h, w, 3) with noise."""
         if self._tile is None:
             return image
         within = max(NOISE_TILE[0] - image.shape[0], 1), max(NOISE_TILE[1] - image.shape[1], 1)

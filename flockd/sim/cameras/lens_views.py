@@ -1,4 +1,4 @@
-"""What a camera with any lens sees: pinhole views toward the parts of its field of view, sampled anew."""
+"""The view of a camera with any lens, sampled from pinhole views of the parts of its field of view."""
 
 from __future__ import annotations
 

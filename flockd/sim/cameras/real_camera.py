@@ -18,7 +18,7 @@ from flockd.sim.cameras.shutter import CameraMotion, LensField, Shaking, exposed
 from flockd.sim.renderer.renderer import View
 
 _STEPS = 1 << 14
-"""Of linear light in the table back: each grey level has five at least, so that all 256 come back as they were."""
+"""Steps of linear light in the table of grey levels: at least five a level, so that all 256 survive both ways."""
 _GREY = np.arange(256) / 255.0
 _LINEAR = np.where(_GREY <= 0.04045, _GREY / 12.92, ((_GREY + 0.055) / 1.055) ** 2.4).astype(np.float32)
 _LIGHT = np.minimum(np.arange(1 << 16) / (_STEPS - 1), 1.0)
@@ -64,14 +64,14 @@ class Shot:
 
 
 class CameraClock:
-    """One camera's: where in its period it runs is drawn once, jitter and drops for each image."""
+    """The times of one camera's images: its phase is drawn once, jitter and losses for each image."""
 
     def __init__(self, config: CameraTimingConfig, rng: np.random.Generator) -> None:
         self._config, self._rng = config, rng
         self._before_s = float(config.apart_s * rng.random())
 
     def shot(self, time_s: float) -> Shot:
-        """Of the frame set of a time."""
+        """The times of its image in the frame set of a time."""
         jitter, dropped = self._rng.random(2)
         stamp_s = time_s - self._before_s
         shown_s = stamp_s - self._config.delay_s - self._config.jitter_s * float(jitter)
@@ -122,7 +122,7 @@ _HALO_RAD = 0.15
 
 
 _PIXELS = 2.0
-"""The sun is in the image where a pixel is so near to it, in pixels."""
+"""The sun is in the image if a pixel is within this distance of it, in pixels."""
 
 
 def veiled(light: Float32Array, flare: float, lens: LensField, sky: BoolArray, sun: FloatArray) -> Float32Array:
@@ -193,7 +193,7 @@ class RealCamera:
 def real_cameras(
     config: CamerasConfig, cameras: Mapping[str, Camera], drones: int, seed: int
 ) -> dict[tuple[int, str], RealCamera]:
-    """The same lenses on each of so many drones, by drone (from 0) and name."""
+    """The cameras of all drones, with the same lenses on each, by drone (from 0) and name."""
     tile = NoiseTile(np.random.default_rng([seed, 6]))
     lenses = {name: LensField.of(camera) for name, camera in cameras.items()}
     return {

@@ -26,7 +26,7 @@ from flockd.sim.renderer.renderer import View
 
 _PROPELLERS, _SPREAD = 4, 0.1
 _OF_REVOLUTIONS = 0.8
-"""Share of the power; the rest is of blades, two a propeller."""
+"""Share of the power at the propellers' frequency; the rest is at that of their two blades."""
 
 
 class Shaking:
@@ -73,7 +73,7 @@ class CameraMotion:
 
 @dataclass(frozen=True, eq=False)
 class LensField:
-    """How pixels of a lens move with it: made once for each camera."""
+    """How the pixels of a lens move when its camera moves; computed once for each camera."""
 
     u: Float32Array
     v: Float32Array
@@ -92,7 +92,7 @@ class LensField:
 
     @classmethod
     def of(cls, camera: Camera) -> LensField:
-        """Of a camera."""
+        """The field of a camera's lens."""
         width, height = camera.size
         u, v = np.meshgrid(np.arange(width), np.arange(height))
         rays = camera.rays(np.stack([u.ravel() + 0.5, v.ravel() + 0.5], axis=1))

@@ -141,7 +141,7 @@ _FALSE_SPEED_M_S = 0.7
 
 
 class TrackedNeighbours:
-    """What one drone's own tracker knows of the others, from detections that are made up from the truth."""
+    """The neighbours that one drone's tracker knows, from detections that are made up from the truth."""
 
     def __init__(self, scenario: ScenarioConfig, config: DetectionsConfig, drone: int) -> None:
         self._config, self._drone, self._step_s = config.filled, drone, scenario.drone.step_s
@@ -238,7 +238,7 @@ def fly_by_hand(person: Navigator, i: int, time_s: float, place: FloatArray, com
 
 
 def start_yaw(scenario: ScenarioConfig) -> float:
-    """The heading with which all begin: the course of the scenario's own mission; else north."""
+    """The heading, rad, with which all drones begin: the first course of the scenario's own mission; else north."""
     start = np.mean([vehicle.position_m[:2] for vehicle in scenario.vehicles], axis=0)
     navigator = Navigator(scenario.drone.mission, scenario.drone.safety.gate)
     return navigator.step(at_home(0.0, start)).course_rad or 0.0

@@ -42,7 +42,7 @@ class FlightFilm:
         self._trails: deque[FloatArray] = deque(maxlen=round(_TRAIL_S / scenario.drone.step_s))
 
     def add(self, time_s: float, position: FloatArray, removed: Collection[int] = ()) -> None:
-        """A step, with all drones' places (n, 3), NED, m; those that were taken out are not drawn."""
+        """Adds the image of a step, with all drones at (n, 3) m NED; ``removed`` drones are not drawn."""
         if time_s == 0.0:
             self._trails.clear()
         position = np.array(position)

@@ -40,8 +40,8 @@ class LiveControls:
         clock: Callable[[], float] = time.monotonic,
         wait: Callable[[threading.Condition, float], object] = threading.Condition.wait,
     ) -> None:
-        """``identity``: of all its drones; ``by_sight``: how these fly; ``wait``: until something has changed, for so
-        long at most."""
+        """``identity``: that of all its drones; ``by_sight``: whether they fly by sight; ``clock``: monotonic seconds;
+        ``wait``: waits for a change, for so many seconds at most."""
         self._scenario, self._identity, self._clock, self._wait_on = scenario, identity, clock, wait
         self._by_sight = by_sight
         self._checks = OrderChecks(identity, time.monotonic)
@@ -56,7 +56,7 @@ class LiveControls:
 
     @property
     def disturbed(self) -> Disturbances:
-        """As of now."""
+        """The present disturbances."""
         with self._changed:
             return self._disturbed
 
@@ -83,7 +83,7 @@ class LiveControls:
             return False
 
     def reply(self, last: str, payload: bytes) -> Mapping[str, object]:
-        """To a query under the simulator's key: `state`, `time`, or a control's name."""
+        """The reply to a query of the simulator; ``last`` is `state`, `time` or the name of a control."""
         match last:
             case "state":
                 return {**self.state()}
@@ -107,7 +107,7 @@ class LiveControls:
         return AnswerMessage(accepted=True, sentence=sentence)
 
     def state(self) -> SimulationMessage:
-        """How it is doing."""
+        """Time, pace and disturbances of the simulation, as the fleet page shows them."""
         with self._changed:
             gust_m_s = self._disturbed.gust_m_s
             off: dict[str, list[str]] = {}
@@ -127,7 +127,7 @@ class LiveControls:
             )
 
     def _done(self, control: str, given: Mapping[str, object]) -> str:
-        """What was done; raises ValueError where it cannot be."""
+        """Obeys a control; returns a sentence of what was done. Raises ValueError if it cannot be done."""
         match control, given:
             case "pause", _:
                 self._paused = True

@@ -79,15 +79,15 @@ class Autopilots(ExitStack, ABC):
 
     @abstractmethod
     def start(self) -> None:
-        """Starts all."""
+        """Starts all autopilots."""
 
     def programs(self) -> Sequence[Program]:
-        """Those that are programs of their own."""
+        """The autopilots that run as programs of their own."""
         return tuple(self._programs)
 
 
 class SimulatedAutopilots(Autopilots):
-    """The autopilots that `flockd.onboard.autopilot` simulates, on the simulator's own vehicle model."""
+    """Fake autopilots (`flockd.sim.autopilot`) on the simulator's own vehicle model."""
 
     name = "fake autopilot"
 

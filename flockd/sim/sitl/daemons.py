@@ -86,7 +86,7 @@ class Daemons(ExitStack):
         self._programs = self.enter_context(Programs())
 
     def start(self) -> None:
-        """Starts all."""
+        """Starts all daemons."""
         for config, listener in zip(self._configs, self._listeners, strict=True):
             file = self._folder / f"{config.name}.yaml"
             values = config.model_dump(mode="json", exclude_defaults=True)
@@ -101,15 +101,15 @@ class Daemons(ExitStack):
             )
 
     def programs(self) -> tuple[Program, ...]:
-        """In the order of the configurations."""
+        """The daemons in the order of the configurations."""
         return tuple(self._programs)
 
     def status(self, number: int) -> str:
-        """Its last status line; empty before it has started."""
+        """The last status line of a daemon, from 0; empty before it has started."""
         return self._listeners[number].heard().status
 
     def is_ready(self, number: int) -> bool:
-        """Its networks are loaded, its autopilot is connected and frames arrive."""
+        """Whether a daemon's networks are loaded, its autopilot is connected and frames arrive."""
         return self._listeners[number].heard().ready
 
     def end(self) -> dict[str, int]:

@@ -52,7 +52,7 @@ class FrameServer:
         self._thread.start()
 
     def frames(self) -> tuple[Poses, ...]:
-        """All so far. Raises the exception that ended the thread."""
+        """The poses behind all frame sets so far. Raises the exception that ended the thread."""
         if self._failure is not None:
             raise self._failure
         return tuple(self._frames)

@@ -1,7 +1,7 @@
 """A ground station for a fleet of simulated autopilots, which also receives their true poses.
 
-Poses come over the MAVLink stream on which PX4 SITL sends its true state to a simulator; `flockd.onboard.autopilot`'s
-simulated autopilot sends the same.
+Poses come over the MAVLink stream on which PX4 SITL sends its true state to a simulator; flockd's fake autopilot sends
+the same.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ _RECEIVED = {
 
 @dataclass(frozen=True, eq=False)
 class Poses(FlockPose):
-    """Where a flock of n drones is, NED metres from the world's origin, and how it moves."""
+    """Poses of n drones, NED metres from the world's origin, and their velocities."""
 
     velocity: FloatArray
     """(n, 3) m/s."""
@@ -105,7 +105,7 @@ class GroundStation:
             vehicle.socket.close()
 
     def is_connected(self, number: int) -> bool:
-        """Its pose and its mode have been received."""
+        """Whether its pose and its mode have been received."""
         vehicle = self._vehicles[number]
         return vehicle.pose is not None and vehicle.mode is not None
 
@@ -125,7 +125,7 @@ class GroundStation:
         return Poses(now, *map(np.array, zip(*of_each, strict=True)))
 
     def mode_is(self, number: int, mode: Mode) -> bool:
-        """It flies in this mode."""
+        """Whether it flies in this mode."""
         _, main, sub = mavutil.px4_map[mode]
         return bool(self._vehicles[number].mode == main << 16 | sub << 24)
 
@@ -136,7 +136,7 @@ class GroundStation:
         return "" if flown is None else {**named, **FURTHER_MODES}.get(flown, str(flown))
 
     def is_armed(self, number: int) -> bool:
-        """Its motors run."""
+        """Whether its motors run."""
         return self._vehicles[number].armed
 
     def last_text(self, number: int) -> str:

@@ -40,7 +40,7 @@ class Program:
 
     @property
     def ended(self) -> int | None:
-        """Its exit code; None while it runs."""
+        """The exit code; None while the program runs."""
         return self.process.poll()
 
     def last_output(self) -> str:
@@ -52,7 +52,7 @@ class Program:
 
 
 class Programs:
-    """All of one kind, between ``__enter__`` and ``__exit__``.
+    """Programs of one kind, which ``__exit__`` ends.
 
     Each has a session of its own, so that Ctrl-C reaches the simulator alone, which then ends them in order. One whose
     simulator was killed gets SIGTERM from Linux.

@@ -1,4 +1,4 @@
-"""Where all drones were a moment ago: cameras expose at other instants than pilots step."""
+"""The poses of all drones in the last second: cameras expose at other instants than pilots step."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from flockd.core.messages import FloatArray
 from flockd.flight.geometry import rotation_from_vector, vector_from_rotation
 
 KEPT_S = 1.0
-"""Longer than anything is late."""
+"""How long poses are kept: longer than the largest delay of an image."""
 _SAME_TIME_S = 1e-9
 _BETWEEN_S = 0.01
-"""Over which motion is measured."""
+"""Interval over which motion is measured."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ class PoseTrail:
         self._poses: deque[FlockPose] = deque()
 
     def add(self, pose: FlockPose) -> None:
-        """The newest pose; one that is not later than the last is not kept."""
+        """Adds the newest pose; a pose that is not later than the last is ignored."""
         if self._poses and pose.time_s <= self._poses[-1].time_s:
             return
         self._poses.append(pose)

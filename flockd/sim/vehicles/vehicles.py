@@ -19,17 +19,17 @@ from flockd.sim.vehicles.pose_trail import KEPT_S, FlockPose, PoseTrail
 
 @dataclass(frozen=True)
 class Disturbances:
-    """As of one step. Drones are counted from 0."""
+    """Disturbances of a live flight in one step. Drones are counted from 0."""
 
     gust_m_s: float | None = None
     """As `vehicle.gust_m_s` of the scenario; None: that one."""
     cameras_off: frozenset[tuple[int, str]] = frozenset()
-    """Of drones, by name: they deliver no images."""
+    """Drone and name of each camera that delivers no images."""
     removed: frozenset[int] = frozenset()
-    """Drones that are in the world no more."""
+    """Drones that were removed from the world."""
 
     def cameras_off_of(self, drone: int) -> frozenset[str]:
-        """The names of those of one drone."""
+        """Names of the cameras of one drone that are off."""
         return frozenset(name for i, name in self.cameras_off if i == drone)
 
 
@@ -42,7 +42,7 @@ MAX_LEAN_M_S2 = GRAVITY_M_S2 * math.tan(math.radians(45.0))
 _MAX_SUBSTEP_S = 0.02
 _SAME_TIME_S = 1e-9
 _AWAY_M = 1e5
-"""To the north of the origin: out of every drone's sight."""
+"""Distance of removed drones, north of the origin: out of every drone's sight."""
 _DRAG_PER_S = 0.3
 """Deceleration by the air for each m/s against it: what a multirotor leans against to hold its speed."""
 MAX_CLIMB_M_S = 1.5
@@ -105,7 +105,7 @@ class Vehicles:
         self.trail.add(FlockPose(0.0, self.position, self.R_ned_body))
 
     def disturb(self, disturbed: Disturbances) -> None:
-        """From now on other gusts blow, and drones are gone: far away, at a standstill."""
+        """Sets the gusts from now on, and moves removed drones far away, at a standstill."""
         gust_m_s = self._config.gust_m_s if disturbed.gust_m_s is None else disturbed.gust_m_s
         if gust_m_s != self._gust_m_s:
             self._gust_m_s = gust_m_s
@@ -197,7 +197,7 @@ class Vehicles:
 
 
 class EstimateErrors:
-    """How one drone's autopilot is wrong about its own state: errors that wander, seeded.
+    """Errors of one drone's autopilot about its own state, which wander, from a seed.
 
     The autopilot flies by its estimate, so that the vehicle's true velocity, height and heading err the other way.
     """
@@ -217,7 +217,7 @@ class EstimateErrors:
         """(2,) m north and east."""
 
     def advance(self, time_s: float) -> None:
-        """To `time_s`; never back."""
+        """Moves the errors on to `time_s`; an earlier time changes nothing."""
         config, before_s = self._config, time_s if self._time_s is None else self._time_s
         elapsed_s, self._time_s = time_s - before_s, max(time_s, before_s)
         if elapsed_s <= 0.0:

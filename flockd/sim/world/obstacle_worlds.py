@@ -31,9 +31,9 @@ _SPAN_PARTS = 6
 
 
 def obstacles_of(scenario: ScenarioConfig) -> Obstacles:
-    """Those of its world, drawn from its seed; none where it has no `world.obstacles`.
+    """The obstacles of a scenario's world, drawn from its seed; none without `world.obstacles`.
 
-    Raises UsageError where they do not fit in.
+    Raises UsageError if they do not fit into the area.
     """
     if scenario.world.obstacles is None:
         return Obstacles()

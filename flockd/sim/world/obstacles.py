@@ -36,7 +36,7 @@ class _Upright:
 
     @property
     def heights(self) -> tuple[float, float]:
-        """Its lowest and its highest."""
+        """Lowest and highest height, m."""
         return self.foot, self.top
 
 
@@ -53,13 +53,16 @@ class Frustum(_Upright):
     material: Material = "bark"
 
     def between(self, low: float, high: float) -> Shape:
-        """What of it lies between two heights that it reaches."""
+        """The outline of its part between two heights, m, that it reaches."""
         rise = (np.clip([low, high], self.foot, self.top) - self.foot) / (self.top - self.foot)
         radius = float((self.foot_radius + rise * (self.top_radius - self.foot_radius)).max())
         return self.north, self.east, 0.0, 0.0, 0.0, radius
 
     def clearance(self, points: FloatArray) -> FloatArray:
-        """(n,) from points (n, 3) to its surface, negative inside: a polygon in distance from the axis and height."""
+        """Distances (n,) m from points (n, 3) NED to its surface, negative inside.
+
+        Its section is a polygon in distance from the axis and height.
+        """
         away, height = np.hypot(points[:, 0] - self.north, points[:, 1] - self.east), -points[:, 2]
         corners = [(0.0, self.foot), (self.foot_radius, self.foot), (self.top_radius, self.top), (0.0, self.top)]
         place = np.column_stack([away, height])
@@ -83,11 +86,11 @@ class Box(_Upright):
     material: Material = "plaster"
 
     def between(self, low: float, high: float) -> Shape:
-        """What of it lies between two heights that it reaches."""
+        """The outline of its part between two heights, m, that it reaches."""
         return self.north, self.east, self.half_length, self.half_width, self.heading, 0.0
 
     def clearance(self, points: FloatArray) -> FloatArray:
-        """(n,) from points (n, 3) to its surface, negative inside."""
+        """Distances (n,) m from points (n, 3) NED to its surface, negative inside."""
         cosine, sine = math.cos(self.heading), math.sin(self.heading)
         north, east = points[:, 0] - self.north, points[:, 1] - self.east
         half = np.array([self.half_length, self.half_width, (self.top - self.foot) / 2])
@@ -113,12 +116,12 @@ class Capsule:
 
     @property
     def heights(self) -> tuple[float, float]:
-        """Its lowest and its highest."""
+        """Lowest and highest height, m."""
         low, high = sorted((self.height, self.other_height))
         return low - self.radius, high + self.radius
 
     def between(self, low: float, high: float) -> Shape:
-        """What of it lies between two heights that it reaches.
+        """The outline of its part between two heights, m, that it reaches.
 
         Exact for upright and level ones; of a sloping one the axis is cut where it leaves the heights by the radius.
         """
@@ -132,7 +135,7 @@ class Capsule:
         return middle.real, middle.imag, abs(way) / 2, 0.0, math.atan2(way.imag, way.real), margin
 
     def clearance(self, points: FloatArray) -> FloatArray:
-        """(n,) from points (n, 3) to its surface, negative inside."""
+        """Distances (n,) m from points (n, 3) NED to its surface, negative inside."""
         ends = (self.north, self.east, -self.height), (self.other_north, self.other_east, -self.other_height)
         return _to_line(points, *np.array(ends)) - self.radius
 
@@ -148,7 +151,7 @@ def _to_line(points: FloatArray, one: FloatArray, other: FloatArray) -> FloatArr
 
 
 class Obstacles:
-    """Any number of solids, which may overlap."""
+    """Solids, which may overlap."""
 
     def __init__(self, solids: Sequence[Solid] = ()) -> None:
         self.solids = tuple(solids)
@@ -185,7 +188,7 @@ class Obstacles:
         return nearest.reshape(np.shape(points)[:-1])
 
     def outlines(self) -> FloatArray:
-        """(k, 7) of `FlightLog.obstacles`, a sloping line without its round ends."""
+        """The solids (k, 7) as `FlightLog.obstacles` has them; a sloping line without its round ends."""
         middle, sides, margin = self._around[:, :2], self._around[:, 2:4], self._around[:, 5:]
         line = (sides[:, :1] > 0) & (sides[:, 1:] == 0)
         sides = np.hstack([np.where(sides[:, :1] > 0, sides[:, :1], margin), np.where(line, margin, sides[:, 1:])])

@@ -64,7 +64,7 @@ class Scenery:
         self.rock = add(textures.soil(rng))
 
     def add_texture(self, texture: Float32Array) -> int:
-        """Its number."""
+        """Adds a texture; returns its number."""
         self.textures.append(texture)
         return len(self.textures) - 1
 

@@ -195,7 +195,7 @@ def test_the_flocks_figures_by_hand() -> None:
     flock = summarise(_hand_made())["flock"]
     assert flock["min_distance_m"] == pytest.approx(math.hypot(0.6, 0.5))
     assert flock["min_distance_after_10s_m"] == pytest.approx(math.hypot(3.99, 0.5))
-    assert (flock["order_tail"], flock["union_tail"], flock["connectivity_tail"]) == pytest.approx((1.0, 1.0, 1.0))
+    assert (flock["order_tail"], flock["union_tail"]) == pytest.approx((1.0, 1.0))
     assert flock["safety"] == pytest.approx(29 / 30)  # nearer than 1 m at one step
     # Of drones that stand still, what is left of a velocity points anywhere.
     log = _hand_made()
