@@ -68,7 +68,7 @@ class CampaignConfig(Section):
         return self.measure or tuple(MEASURES)
 
     def seed_of(self, cell: int, number: int) -> int:
-        """The scenario's seed in one flight, both from 0."""
+        """The scenario's seed of a cell's flight of this number, both from 0."""
         return self.seed + number + (0 if self.paired else cell * self.seeds)
 
     @model_validator(mode="after")

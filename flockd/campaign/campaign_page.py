@@ -130,7 +130,7 @@ Points = list[tuple[Any, Sequence[float]]]
 
 
 def parameter_curves(results: Results, figure: Figure) -> Drawing:
-    """One panel a parameter: the figure's mean over its values, with the 95 % confidence interval of the mean.
+    """A panel for each parameter: the figure's mean over its values, with the 95 % confidence interval of the mean.
 
     With cases, one line a case.
     """
@@ -166,13 +166,13 @@ def parameter_curves(results: Results, figure: Figure) -> Drawing:
 
 
 def label_of(figure: Figure) -> str:
-    """Its name and unit."""
+    """A figure's name and unit."""
     measure = MEASURES[figure]
     return f"{measure.name}, {measure.unit}" if measure.unit else measure.name
 
 
 def shown(value: Any) -> str:
-    """A parameter's value."""
+    """A parameter's value as text."""
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 

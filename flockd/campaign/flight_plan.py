@@ -37,13 +37,13 @@ class Run:
 
     @property
     def name(self) -> str:
-        """By which it is known in results and commands."""
+        """Its name in results and commands."""
         return f"c{self.cell}-s{self.number}"
 
 
 @dataclass(frozen=True)
 class Task:
-    """What is sent to where it is flown: one flight, of a scenario's own values and those put over them."""
+    """One flight as it is sent to a process: a scenario's own values, and values that override them."""
 
     run: Run
     config: CampaignConfig
@@ -52,7 +52,7 @@ class Task:
     """By dotted key."""
 
     def scenario(self, *, scatter: bool = True) -> ScenarioConfig:
-        """Raises ValueError (pydantic's ValidationError) for values that cannot be flown, and UsageError for starts."""
+        """The flight's scenario. Raises ValidationError for values that cannot be flown, UsageError for starts."""
         values = merged(self.base, {**self.overrides, "seed": self.config.seed_of(self.run.cell, self.run.number)})
         count = values.pop(DRONES, None)
         scenario = ScenarioConfig.model_validate(values)
@@ -62,7 +62,7 @@ class Task:
 
 
 def merged(base: Mapping[str, Any], overrides: Mapping[str, Any]) -> Values:
-    """The values with others over them, by dotted key. Raises ValueError where a key leads into a list or a value."""
+    """The values with overrides by dotted key. Raises ValueError if a key leads into a list or a plain value."""
     values = dict(base)
     for key, value in overrides.items():
         *sections, last = key.split(".")
@@ -85,7 +85,7 @@ Places = Mapping[KeyPath, Place]
 
 @dataclass(frozen=True)
 class Cell:
-    """One combination of what varies."""
+    """One combination of the values that vary."""
 
     number: int
     """From 0, in the order of the file; the last key of `vary` changes fastest."""
@@ -95,7 +95,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Plan:
-    """All flights of a campaign, as values only: what it takes is no longer read from files."""
+    """All flights of a campaign, as values: nothing more is read from files."""
 
     config: CampaignConfig
     base: Mapping[str, Any]
@@ -144,7 +144,7 @@ class Plan:
         return cls(config, base)
 
     def to_json(self) -> str:
-        """All of it, and the version of flockd: what has the same text has the same flights.
+        """The whole plan and the version of flockd: plans with the same text have the same flights.
 
         In the order of the file, by which the cells are numbered.
         """
@@ -159,7 +159,7 @@ class Plan:
 
     @cached_property
     def cells(self) -> tuple[Cell, ...]:
-        """All combinations, in order."""
+        """All cells, in order."""
         axes = {CASE: tuple(self.config.cases)} if self.config.cases else {}
         axes |= {key: variation.values for key, variation in self.config.vary.items()}
         combinations = enumerate(itertools.product(*axes.values()))
@@ -167,11 +167,11 @@ class Plan:
 
     @property
     def flights(self) -> int:
-        """How many there are."""
+        """Number of flights."""
         return len(self.cells) * self.config.seeds
 
     def task(self, cell: Cell, number: int) -> Task:
-        """What one flight is made of."""
+        """One flight of a cell, by its number from 0."""
         varied = {key: value for key, value in cell.parameters.items() if key != CASE}
         of_case = self.config.cases[cell.parameters[CASE]] if CASE in cell.parameters else {}
         return Task(Run(cell.number, number), self.config, self.base, {**self.config.fixed, **of_case, **varied})

@@ -52,12 +52,12 @@ class Results:
 
     @property
     def figures(self) -> tuple[Figure, ...]:
-        """Those that a flight has a value of."""
+        """Figures of which at least one flight has a value."""
         return tuple(figure for figure in self.plan.config.wanted if any(row[figure] is not None for row in self.rows))
 
     @property
     def parameters(self) -> tuple[str, ...]:
-        """What varies."""
+        """Names of the parameters that vary."""
         return tuple(self.plan.cells[0].parameters)
 
     def values_of(self, parameter: str) -> tuple[Any, ...]:
@@ -65,7 +65,7 @@ class Results:
         return tuple(dict.fromkeys(_hashable(cell.parameters[parameter]) for cell in self.plan.cells))
 
     def cells_with(self, wanted: Mapping[str, Any]) -> tuple[int, ...]:
-        """Cells that have these values of the grid."""
+        """Numbers of the cells that have these values, by parameter."""
         return tuple(
             cell.number
             for cell in self.plan.cells
@@ -106,7 +106,7 @@ _DRAWS = 9_999
 
 @dataclass(frozen=True)
 class Verdict:
-    """On one figure."""
+    """The comparison of one figure."""
 
     figure: Figure
     first: float
@@ -121,7 +121,7 @@ class Verdict:
 
     @property
     def says(self) -> Literal["better", "worse", "no difference shown"]:
-        """The verdict on the second campaign."""
+        """Whether the second campaign is better."""
         if self.p > LEVEL:
             return "no difference shown"
         return "better" if (self.difference.mean > 0) == (MEASURES[self.figure].better == "higher") else "worse"
@@ -153,7 +153,7 @@ class Comparison:
 
 
 def compare(first: Results, second: Results) -> Comparison:
-    """Over the cells that both have; seeds that both flew are pairs. Raises UsageError if nothing can be compared."""
+    """Compares flights of the same cell and seed as pairs. Raises UsageError if nothing can be compared."""
     theirs = {_key(cell.parameters): cell.number for cell in second.plan.cells}
     cells = [(c.number, theirs[_key(c.parameters)]) for c in first.plan.cells if _key(c.parameters) in theirs]
     figures = [figure for figure in first.figures if figure in second.figures]
@@ -182,9 +182,9 @@ def _verdict(first: Results, second: Results, figure: Figure, cells: list[tuple[
 
 
 def paired_p(differences: FloatArray) -> float:
-    """By flipping signs: of (n,) differences, how often their mean is as far from zero if each could be either way.
+    """The p value of differences (n,) by a permutation test, which flips their signs.
 
-    Of all ways, or of `_DRAWS` of them where there are more.
+    It is the share of all ways to give signs, or of `_DRAWS` random ones, whose mean is at least as far from zero.
     """
     from scipy.stats import permutation_test  # noqa: PLC0415 - heavy
 

@@ -41,7 +41,7 @@ _STRIDE_PX = 6
 
 
 def dataset_config(dataset: Dataset, config: DroneConfig | None, depth: Depth, flow: str | None) -> DroneConfig:
-    """The settings to replay with, for the dataset's camera: scale by the network, and the flow model that is named.
+    """The settings of a replay: the dataset's camera, scale by the network, and the flow model that is named.
 
     ``config``: a drone's; None: settings for a hand-held camera.
     """
@@ -110,7 +110,7 @@ class Pair:
 
     @property
     def error(self) -> tuple[float, float] | None:
-        """Degrees, and metres between the ends; None without an estimate or without the truth."""
+        """Errors of the motion in degrees and metres; None without an estimate or without the truth."""
         if self.found is None or self.true is None:
             return None
         rotation = rotation_angle_deg(self.found.rotation.T @ self.true.rotation)

@@ -112,7 +112,7 @@ def _distance_lines(axes: Axes, time_s: FloatArray, position: FloatArray) -> Non
 
 
 def flock_lines(axes: Axes, time_s: FloatArray, values: FloatArray) -> None:
-    """(S, K) values: a line for each of few drones, a band for many."""
+    """Draws values (S, K) over times (S,) s: a line for each of few drones, a band for many."""
     count = values.shape[1]
     if count <= FEW:
         for number in range(count):
@@ -126,7 +126,7 @@ def flock_lines(axes: Axes, time_s: FloatArray, values: FloatArray) -> None:
 
 
 def flock_handles(drones: int) -> list[Line2D | Patch]:
-    """Of a legend: what `flock_lines` draws."""
+    """Legend entries of what `flock_lines` draws."""
     if drones <= FEW:
         return [*drone_handles(drones)]
     return [

@@ -69,7 +69,7 @@ def load_plates(path: Path) -> list[Plate]:
 
 
 def filmstrip(frame: KeyFrame) -> UInt8Array:
-    """(h, w, 3) RGB of one moment: a row of camera images with the drones found in them, one of depth, one of flow."""
+    """The plate (h, w, 3) RGB of a key frame: a row of images with detections, one of depth, one of flow."""
     cameras = sorted(frame.cameras, key=_rig_place)
     across = min((_WIDTH - _LEFT - _RIGHT - _GAP * (len(cameras) - 1)) // len(cameras), _WIDEST)
     down = round(across * max(image.shape[0] / image.shape[1] for image in frame.images.values()))

@@ -70,7 +70,7 @@ def prepare_folder(directory: Path, *, force: bool = False) -> Path | None:
 
 @contextmanager
 def prepare_report_folder(directory: Path, *, force: bool = False) -> Iterator[None]:
-    """Makes the folder for a report of recordings once what is done meanwhile went well.
+    """Makes the folder for a report of recordings, after the body of the ``with`` statement has succeeded.
 
     A flight or report that is there is removed with ``force`` only. Raises UsageError at once for a folder in the way.
     """

@@ -78,7 +78,7 @@ def colour_of(number: int, count: int) -> str:
 
 
 def drone_handles(drones: int) -> list[Line2D]:
-    """Of a legend: each drone's line. Drones count from 0 in the log and from 1 in the report, as in the paper."""
+    """Legend entries, a line for each drone. Drones count from 0 in the log, and from 1 in the report and the paper."""
     return [Line2D([], [], color=colour_of(i, drones), label=f"drone {i + 1}") for i in range(drones)]
 
 

@@ -176,7 +176,7 @@ def add_obstacles(axes: Axes, log: FlightLog) -> None:
 
 
 def in_the_way(log: FlightLog) -> BoolArray:
-    """(K,) which obstacles reach into the heights that were flown."""
+    """(K,): which obstacles reach into the heights that were flown."""
     heights = -log.position[..., 2]
     low, high = heights.min() - _FLOWN_BAND_M, heights.max() + _FLOWN_BAND_M
     return np.asarray((log.obstacles[:, 5] <= high) & (log.obstacles[:, 6] >= low))

@@ -198,7 +198,7 @@ class FakeAutopilot:
 
     @property
     def failsafe(self) -> bool:
-        """Whether it is in another mode than it was asked for."""
+        """Whether its failsafe flies another mode than the one it was asked for."""
         return self.mode != self.intended_mode
 
     @property
@@ -207,12 +207,12 @@ class FakeAutopilot:
         return self.checks.has_ground_station(self._clock())
 
     def pilot_arms(self) -> None:
-        """The pilot starts the motors."""
+        """Arms, as its pilot does with the sticks; without effect where a check fails."""
         with self._lock:
             self._arm()
 
     def pilot_selects(self, mode: Mode) -> None:
-        """The pilot turns the switch."""
+        """Changes the mode, as its pilot does with the switch."""
         with self._lock:
             self.intended_mode = mode
             self._update_mode()
@@ -231,7 +231,7 @@ class FakeAutopilot:
             sender.sendto(data, self._socket.getsockname())
 
     def write(self, data: bytes) -> None:
-        """Takes what pymavlink has packed."""
+        """Sends a packet of pymavlink to the companion computer and the simulator."""
         if self.silent:
             return
         self._socket.sendto(data, self._link)
@@ -366,7 +366,7 @@ class FakeAutopilot:
                 return Demand(np.zeros(2), self._hold_down_m, self._hold_yaw_rad)
 
     def followed(self) -> Demand:
-        """The newest setpoint, no faster than may be flown."""
+        """The demand of the newest setpoint, at MPC_XY_VEL_MAX at most."""
         asked = self.setpoints[-1][1]
         speed_m_s, most_m_s = float(np.linalg.norm(asked.velocity)), self.parameters["MPC_XY_VEL_MAX"]
         down_m = float(self.state.position[2]) + asked.sink_m_s  # the vehicle flies a metre that is missing at 1 m/s

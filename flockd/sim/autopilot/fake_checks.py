@@ -37,15 +37,15 @@ class FakeChecks:
         self._told: frozenset[str] | None = None
 
     def hear_ground_station(self, now_s: float) -> None:
-        """A ground station's heartbeat came; before it no text is sent."""
+        """Takes a ground station's heartbeat; without one no text is sent."""
         self._ground_station_s = now_s
 
     def has_ground_station(self, now_s: float) -> bool:
-        """One was heard a moment ago."""
+        """Whether a ground station was heard in the last seconds."""
         return now_s - self._ground_station_s <= GROUND_STATION_S
 
     def announce(self, now_s: float) -> None:
-        """Names the newest event's number, once a second."""
+        """Sends the newest event's number, once a second."""
         if now_s - self._announced_s >= SEQUENCE_S:
             self._announced_s = now_s
             data = struct.pack("<HB", self._sequence, int(self._told is None))
@@ -91,12 +91,12 @@ class FakeChecks:
 
 
 class _Raw:
-    """A message that pymavlink does not have."""
+    """A MAVLink message that pymavlink does not have."""
 
     def __init__(self, number: int, name: str, crc_extra: int, data: bytes) -> None:
         self._number, self._name, self._crc_extra, self._data = number, name, crc_extra, data
 
     def pack(self, mav: mavlink.MAVLink, force_mavlink1: bool = False) -> bytes:
-        """The whole message as it goes over the link."""
+        """The bytes of the whole message."""
         message = mavlink.MAVLink_message(self._number, self._name)
         return bytes(message._pack(mav, self._crc_extra, self._data, force_mavlink1=force_mavlink1))

@@ -32,7 +32,7 @@ ALL_ESTIMATED = 1 | 2 | 4 | 8 | 16 | 32
 
 
 class TelemetryStreams:
-    """Sends each message at its interval, to the link and, of the true pose, to a simulator."""
+    """Sends each message at its interval: to the link, and the true pose to a simulator."""
 
     def __init__(
         self, vehicle: FakeAutopilot, link: mavlink.MAVLink, truth: mavlink.MAVLink, *, started_s: float,

@@ -63,7 +63,7 @@ class Flown:
         seed: int = 0,
         leans: bool = False,
     ) -> None:
-        """At rest at `position`, (3,) metres NED; not `leans`: always level."""
+        """Begins at rest at `position`, (3,) metres NED; without `leans` it stays level."""
         start = StartConfig(position_m=(float(position[0]), float(position[1]), float(position[2])))
         self._vehicles = Vehicles([start], config or VehicleConfig(), yaw_rad=yaw_rad, seed=seed)
         self._leans = leans
@@ -87,7 +87,7 @@ OVERRIDE_FILTER_S, OVERRIDE_SAMPLES = 0.05, 3
 
 
 def stick_curve(sticks: FloatArray, deadzone: float = 0.0) -> FloatArray:
-    """What sticks at -1 to 1 ask for in Position mode, -1 to 1 of the full speed."""
+    """The share of the full speed, -1 to 1, that sticks at -1 to 1 ask for in Position mode."""
     moved = np.sign(sticks) * np.maximum(np.abs(sticks) - deadzone, 0.0) / (1.0 - deadzone)
     curved: FloatArray = (1.0 - STICK_EXPO) * moved + STICK_EXPO * moved**3
     return curved

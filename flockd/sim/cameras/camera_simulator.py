@@ -105,7 +105,7 @@ class CameraSimulator:
             self._real = real_cameras(scenario.camera_faults, lenses, self._count, scenario.seed)
 
     def ground_height(self, north: FloatArray, east: FloatArray) -> FloatArray:
-        """(n,) metres above z = 0 of the ground that is drawn, at points (n,) north and east."""
+        """Heights (n,) m above z = 0 of the drawn ground at points (n,) m north and east."""
         return self._world.height_at(north, east)
 
     def capture(
@@ -190,7 +190,7 @@ FIELD_GRID_M = 3.0
 
 
 def field_grid(extent_m: float) -> FloatArray:
-    """(n, 2) m north and east all over the area of obstacles, where nothing else is to stand: `World.keep_out`."""
+    """Points (n, 2) m north and east all over the area of obstacles, for `World.generate`'s ``keep_out``."""
     axis = np.arange(-extent_m, extent_m + FIELD_GRID_M, FIELD_GRID_M)
     return np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
 

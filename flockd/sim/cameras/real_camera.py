@@ -28,12 +28,12 @@ _BACK = np.rint(
 
 
 def linear_light(image: UInt8Array) -> Float32Array:
-    """Linear light (h, w, 3), 1 for white, of grey levels."""
+    """Linear light (h, w, 3), 1 for white, of an image in grey levels (h, w, 3)."""
     return np.asarray(cv2.LUT(image, _LINEAR), np.float32)
 
 
 def grey_levels(light: Float32Array) -> UInt8Array:
-    """(h, w, 3) of linear light; what is beyond white or below black is cut."""
+    """Grey levels (h, w, 3) of linear light; light beyond white or below black is cut."""
     steps = cv2.multiply(light, np.full(4, _STEPS - 1.0), dtype=cv2.CV_16U)
     return np.asarray(_BACK[steps], np.uint8)
 
@@ -54,7 +54,7 @@ def jpeg(image: UInt8Array, quality: int, reduce: Literal[1, 2, 4] = 1) -> UInt8
 
 @dataclass(frozen=True)
 class Shot:
-    """One image's times."""
+    """The times of one image."""
 
     stamp_s: float
     """Its own time stamp."""
@@ -82,10 +82,10 @@ NOISE_TILE = (1031, 1033)
 
 
 class NoiseTile:
-    """Standard normal noise that images take crops of."""
+    """A tile of standard normal noise, of which images take crops."""
 
     def __init__(self, rng: np.random.Generator, levels: float | None = None) -> None:
-        """``levels``: its standard deviation in grey levels, to which it is then rounded."""
+        """``levels``: standard deviation in grey levels, and noise is rounded to them; None: 1, not rounded."""
         self._tile: NDArray[Any] = rng.standard_normal((*NOISE_TILE, 3), dtype=np.float32)
         if levels is not None:
             self._tile = np.rint(levels * self._tile).clip(-255, 255).astype(np.int16)
@@ -102,7 +102,7 @@ class NoiseTile:
 
 
 def noisy(light: Float32Array, normal: Float32Array, config: SensorNoiseConfig) -> Float32Array:
-    """Linear light (h, w, 3) with a sensor's noise, of standard normal noise of its shape.
+    """Linear light (h, w, 3) with a sensor's noise, made from standard normal noise (h, w, 3).
 
     EMVA 1288, equation of the photon transfer: the variance of a grey value is that of reading, times the square of the
     gain, and the gain times the mean. The gain is white over the electrons that give it.
@@ -155,7 +155,7 @@ class RealCamera:
     """One camera of one drone, with its own phases and noise. Its images depend on no other camera's."""
 
     def __init__(self, config: CamerasConfig, lens: LensField, tile: NoiseTile, seed: tuple[int, ...]) -> None:
-        """``seed`` is of this camera alone."""
+        """``seed``: of this camera alone."""
         self._config, self._lens, self._tile = config, lens, tile
         self.clock = CameraClock(config.timing, np.random.default_rng([*seed, 0]))
         self.shaking = Shaking(config.shake, np.random.default_rng([*seed, 1]))

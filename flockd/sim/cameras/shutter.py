@@ -30,7 +30,7 @@ _OF_REVOLUTIONS = 0.8
 
 
 class Shaking:
-    """Angles of one camera about its axes, by time: sums of tones of seeded frequencies and phases."""
+    """The shake of one camera: angles about its axes, as sums of tones with seeded frequencies and phases."""
 
     def __init__(self, config: ShakeConfig, rng: np.random.Generator) -> None:
         revolutions = config.frequency_hz * rng.uniform(1 - _SPREAD, 1 + _SPREAD, _PROPELLERS)
@@ -40,7 +40,7 @@ class Shaking:
         self._phases = rng.uniform(0, 2 * math.pi, (3, 2 * _PROPELLERS))
 
     def at(self, times_s: FloatArray) -> FloatArray:
-        """(n, 3) rad at times (n,) s."""
+        """Angles (n, 3) rad about the camera's axes at times (n,) s."""
         tones = np.sin(times_s[:, None, None] * self._rad_s + self._phases)
         return np.asarray(tones @ self._amplitudes, np.float64)
 
@@ -152,7 +152,7 @@ def _read_at(lens: LensField, shutter: ShutterConfig) -> FloatArray:
 
 
 def pixel_velocity(view: View, lens: LensField, motion: CameraMotion, within_s: float) -> Float32Array:
-    """(h, w, 2) px/s of what each pixel shows, or of the nearest thing that gets there within the time."""
+    """Velocity (h, w, 2) px/s of what each pixel shows, or of the nearest thing that gets there within the time."""
     with np.errstate(divide="ignore", invalid="ignore"):
         range_m = np.where(lens.z_share > 0.0, view.depth / lens.z_share, np.inf).astype(np.float32)
     turning, moving = _times(lens.by_turn, motion.turn), _times(lens.by_move, motion.velocity)

@@ -56,13 +56,13 @@ class Commands:
     obstacles: list[ObstacleRanges | None]
     """What each drone saw of them; None where it does not look for any."""
     seen_m: list[FloatArray | None]
-    """As of `PilotOutput`."""
+    """See `PilotOutput.seen_m`."""
     neighbours: list[tuple[Neighbour, ...]]
     """What each drone knows of the others."""
 
     @classmethod
     def of(cls, n: int) -> Self:
-        """Standstill of n drones, to be filled."""
+        """Commands of n drones that stand still, to be filled in."""
         still = (np.zeros((n, 2)), np.zeros((n, 2)), np.zeros(n), np.full(n, np.nan))
         return cls(*still, [NO_STATUS] * n, np.zeros((n, 2)), [None] * n, [None] * n, [()] * n)
 
@@ -140,7 +140,7 @@ class SlowedTime:
         self._by_cause_s: dict[str, float] = {}
 
     def add(self, period_s: float, request: Request, verdict: Verdict, degraded_by: Collection[Event] = ()) -> None:
-        """A drone flew for so long; `degraded_by`: why it was last degraded."""
+        """Counts `period_s` of one drone's flight; `degraded_by`: why it was last degraded."""
         self._flown_s += period_s
         asked, setpoint = request.wanted.velocity, verdict.setpoint
         if setpoint is None or math.hypot(*(setpoint.velocity - asked)) <= _SLOWED * math.hypot(*asked):
@@ -159,7 +159,7 @@ class SlowedTime:
 
     @property
     def by_cause(self) -> dict[str, float]:
-        """Shares of the time flown."""
+        """Share of the time flown, by cause."""
         return {cause: slowed_s / self._flown_s for cause, slowed_s in sorted(self._by_cause_s.items())}
 
 

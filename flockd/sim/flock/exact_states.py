@@ -159,7 +159,7 @@ class TrackedNeighbours:
         self, time_s: float, positions: FloatArray, velocities: FloatArray, yaw_rad: float = 0.0,
         cameras_off: frozenset[str] = frozenset(),
     ) -> tuple[Neighbour, ...]:  # fmt: skip
-        """With all drones at (n, 3) m and (n, 3) m/s in NED, and the drone's own heading; called once a step.
+        """The neighbours that the drone knows, with all drones at (n, 3) m and (n, 3) m/s NED; called once a step.
 
         Nobody is detected but in the view of a camera that has no fault and is on.
         """
@@ -222,7 +222,7 @@ def navigator_of(scenario: ScenarioConfig, vehicle: int) -> Navigator:
 
 
 def at_home(time_s: float, place: FloatArray) -> Moment:
-    """Without a flock, at `place` (2,) m from the world's origin: for a navigator that knows nothing of the others."""
+    """The moment of a drone at `place` (2,) m from the world's origin whose navigator knows of no others."""
     return Moment(time_s, place, home_deg=np.array(REFERENCE_DEG))
 
 
@@ -273,6 +273,6 @@ def fly_exact_states(scenario: ScenarioConfig, *, gated: bool = True) -> tuple[F
 
 
 def step_times(scenario: ScenarioConfig) -> FloatArray:
-    """When the steps of a flight begin, (S,) s: 0, step, ... up to but without its end."""
+    """Times (S,) s at which the steps of a flight begin, from 0; its end is not among them."""
     step_s = scenario.drone.step_s
     return np.arange(round(scenario.duration_s / step_s), dtype=float) * step_s

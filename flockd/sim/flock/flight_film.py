@@ -32,7 +32,7 @@ class FlightFilm:
     """Writes one image a step."""
 
     def __init__(self, scenario: ScenarioConfig, picture: Picture, write: Callable[[UInt8Array], None]) -> None:
-        """``picture``: of the first drone's cameras."""
+        """``picture``: gives those of the first drone's cameras; ``write``: takes each image (h, w, 3) RGB."""
         cameras = scenario.drone.rig.cameras
         self._cameras, self._picture, self._write = [one.name for one in cameras], picture, write
         sizes = np.array([one.size_px for one in cameras])
@@ -111,6 +111,6 @@ def _write(image: UInt8Array, at: tuple[int, int], text: str) -> None:
 
 @contextmanager
 def flight_film(scenario: ScenarioConfig, picture: Picture, target: Path) -> Iterator[FlightFilm]:
-    """A film that is at its place when the flight ends. Raises UsageError if it cannot be written there."""
+    """Writes a film to ``target``, which exists after the flight. Raises UsageError if it cannot be written."""
     with written_whole(target) as draft, video_file(draft, target, 1 / scenario.drone.step_s) as write:
         yield FlightFilm(scenario, picture, write)

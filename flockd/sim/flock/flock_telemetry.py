@@ -114,7 +114,7 @@ class FlockTelemetry:
         self._announcer.announce(f"drone{i + 1}", about, partial(self._ask, i), previews.picture)
 
     def begin_again(self) -> None:
-        """Another flight begins, with all drones."""
+        """Forgets orders and steps, as another flight begins with all drones."""
         with self._lock:
             self._orders, self._requests, self._stepped = {}, {}, {}
         self._told = dict.fromkeys(self._drones, State.NORMAL.value)
@@ -122,7 +122,7 @@ class FlockTelemetry:
         self.disturb(UNDISTURBED)
 
     def disturb(self, disturbed: Disturbances) -> None:
-        """Removed drones are announced no longer, restored ones again."""
+        """Takes the disturbances of a step: removed drones are withdrawn, restored ones announced again."""
         before, self._disturbed = self._disturbed, disturbed
         for i in disturbed.removed - before.removed:
             self._announcer.withdraw(f"drone{i + 1}")
@@ -139,14 +139,14 @@ class FlockTelemetry:
         self._sink.publish(f"drone{drone + 1}", "events", {**EventMessage(time_s=time_s, event=sentence)})
 
     def take_requests(self, time_s: float, loop: ControlLoop, vehicles: Vehicles) -> None:
-        """Lets autopilots hold drones, or drones fly on, as operators have asked since the last step."""
+        """Holds and resumes drones as operators have asked since the last step."""
         with self._lock:
             requests, self._requests = self._requests, {}
         for i, command in requests.items():
             loop.hold(i, time_s, vehicles) if command == "hold" else loop.resume(i)
 
     def show_flight(self, time_s: float, loop: ControlLoop) -> None:
-        """Publishes who flies each drone, and why."""
+        """Publishes for each drone whether flockd or its autopilot flies it, and why."""
         for i in self._there():
             _, vehicle, output = self._stepped[i]
             (state, why), reasons = loop.status(i), [reason.text for reason in output.reasons]
@@ -173,7 +173,7 @@ class FlockTelemetry:
         return [i for i in self._drones if i not in self._disturbed.removed]
 
     def take_orders(self, drones: Sequence[int]) -> dict[int, MissionOrder]:
-        """Operators' orders, by drone, that no step has taken yet; they are taken now."""
+        """Returns and removes operators' orders to these drones that no step has taken yet, by drone."""
         with self._lock:
             return {i: self._orders.pop(i) for i in drones if i in self._orders}
 

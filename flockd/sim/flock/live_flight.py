@@ -29,7 +29,7 @@ _LONGEST_WAIT_S = 0.2
 
 
 class LiveControls:
-    """The simulation's loop waits here before each step, and takes what is disturbed from here."""
+    """Pace and disturbances of a live simulation, whose loop waits here before each step."""
 
     def __init__(
         self,
@@ -61,7 +61,7 @@ class LiveControls:
             return self._disturbed
 
     def begin(self) -> None:
-        """A flight begins, the first or another one after a restart: at the same pace, and undisturbed."""
+        """Begins a flight, the first or another one after a restart: at the same pace, without disturbances."""
         with self._changed:
             self._flight += 1
             self._time_s, self._restart, self._paused = 0.0, False, False
@@ -212,7 +212,7 @@ def fly_live(
     gated: bool = True,
     film: FlightFilm | None = None,
 ) -> None:
-    """Flies a scenario, beyond its end, and again from the beginning where that is asked for.
+    """Flies a scenario, beyond its end, and again from the beginning when a person restarts it.
 
     Until KeyboardInterrupt. `controls` give the pace; `eyes` are those of `eyes_of`, None on exact states.
     """

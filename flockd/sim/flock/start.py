@@ -21,13 +21,11 @@ _RINGS = 15
 
 
 def with_drones(scenario: ScenarioConfig, count: int) -> ScenarioConfig:
-    """The scenario with its first `count` vehicles, or with more on a grid around them.
+    """The scenario with its first `count` vehicles, one at least, or with more on a grid around them.
 
     Every further vehicle starts at least 3 m, measured level, from all others, with the first one's velocity. The
-    places depend on nothing but the scenario. Raises ValueError for fewer than one.
+    places depend on nothing but the scenario.
     """
-    if count < 1:
-        raise ValueError(f"{count} drones cannot fly; ask for at least 1")
     given = scenario.vehicles[:count]
     return scenario.model_copy(update={"vehicles": given + _further(scenario.vehicles, count - len(given))})
 

@@ -145,7 +145,7 @@ def fly_commands(
     shown: FlockTelemetry | None,
     disturbed: Disturbances = UNDISTURBED,
 ) -> None:
-    """Takes what operators asked of the autopilots, flies one step, and publishes who flies each drone."""
+    """Obeys operators' requests to autopilots, flies one step, and publishes the state of each drone."""
     if shown is not None:
         shown.take_requests(time_s, loop, vehicles)
     loop.fly(time_s, vehicles, commands, disturbed)
@@ -172,7 +172,7 @@ class ExactStatePilots:
         pictured: bool,
         disturbed: Disturbances = UNDISTURBED,
     ) -> Commands:
-        """Commands for all drones; there are no images. ``builder``: None where no log is kept."""
+        """Commands for all drones, without images. ``builder``: of the flight's log; None: no log is kept."""
         positions, velocities = vehicles.position, vehicles.velocity
         orders = {} if self._shown is None else self._shown.take_orders(range(len(positions)))
         own = None if self._scenario.detections is None else vehicles.known_velocity
@@ -241,7 +241,7 @@ class VisionPilots:
         pictured: bool,
         disturbed: Disturbances = UNDISTURBED,
     ) -> Commands:
-        """Commands for all drones. Each steps as soon as its images are drawn. ``builder``: as of exact states."""
+        """Commands for all drones. Each pilot steps once its images are drawn. ``builder``: see `ExactStatePilots`."""
         steps, render_ms = {}, {}
         flying = [i for i in self._drones if i not in disturbed.removed]
         orders = {} if self._shown is None else self._shown.take_orders(flying)

@@ -92,7 +92,7 @@ class SimulatedAutopilots(Autopilots):
     name = "fake autopilot"
 
     def __init__(self, scenario: ScenarioConfig, speed_factor: float, ground: Ground) -> None:
-        """``ground``: of the world, which range finders measure to."""
+        """``ground``: the world's ground, to which range finders measure."""
         super().__init__(scenario, speed_factor)
         self._ground = ground
         self.ports = tuple(Ports(free_port(), free_port()) for _ in scenario.vehicles)

@@ -30,7 +30,7 @@ _RUN = "from flockd import program; program()"
 def fleet_configs(
     scenario: ScenarioConfig, sitl: DroneConfig, *, ports: Sequence[Ports], endpoint: str, speed_factor: float
 ) -> tuple[DroneConfig, ...]:
-    """What each drone of a scenario that is not flown by hand flies with.
+    """The configuration of each drone of a scenario that is not flown by hand.
 
     The pilot is the scenario's, with the mission's places counted from the drone's own home, which is below its start;
     source, autopilot, safety and telemetry are those of ``sitl``, which has all of them.
@@ -113,7 +113,7 @@ class Daemons(ExitStack):
         return self._listeners[number].heard().ready
 
     def end(self) -> dict[str, int]:
-        """Ends all as SIGTERM does: standstill, Hold, the end of the recording. Exit codes by name."""
+        """Ends all with SIGTERM: standstill, Hold, the end of the recording. Returns exit codes by name."""
         self._programs.end()
         return {program.name: program.process.returncode for program in self._programs}
 

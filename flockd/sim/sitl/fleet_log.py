@@ -55,7 +55,7 @@ def fleet_log(
     recordings: Path,
     speed_factor: float,
 ) -> FlightLog:
-    """The flight's log: the simulator's truth, and what the daemons recorded of their pilots."""
+    """The log of a fleet's flight, from the simulator's truth and the daemons' recordings in a folder."""
     frames, drone = run.frames, configs[0]
     begin_s = frames[0].time_s
     times = np.array([frame.time_s - begin_s for frame in frames])

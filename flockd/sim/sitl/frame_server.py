@@ -48,7 +48,7 @@ class FrameServer:
         self._publisher.close()
 
     def start(self) -> None:
-        """Begins to render and publish."""
+        """Starts the thread that renders and publishes."""
         self._thread.start()
 
     def frames(self) -> tuple[Poses, ...]:

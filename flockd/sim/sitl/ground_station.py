@@ -116,7 +116,7 @@ class GroundStation:
             self._command(vehicle, mavlink.MAV_CMD_REQUEST_MESSAGE, _RECEIVED["AUTOPILOT_VERSION"])
 
     def poses(self) -> Poses:
-        """Poses of all as of now, extrapolated from the last messages."""
+        """Poses of all vehicles at the present time, extrapolated from the last messages."""
         now = self._clock()
         with self._lock:
             poses = [vehicle.pose for vehicle in self._vehicles if vehicle.pose is not None]
@@ -202,7 +202,7 @@ class GroundStation:
 
 
 def home_deg(position: FloatArray) -> tuple[float, float]:
-    """Latitude and longitude of a place, metres NED from the world's origin."""
+    """Latitude and longitude, degrees, of a place (3,) m NED from the world's origin."""
     north_m, east_m = metres_a_degree(REFERENCE_DEG[0])
     return REFERENCE_DEG[0] + float(position[0]) / north_m, REFERENCE_DEG[1] + float(position[1]) / east_m
 

@@ -31,7 +31,7 @@ _numbers = itertools.count(1009 * os.getpid())
 
 @dataclass(frozen=True, eq=False)
 class Program:
-    """A program that was started."""
+    """A program that the simulator has started."""
 
     name: str
     log: Path
@@ -73,7 +73,7 @@ class Programs:
     def start(
         self, name: str, command: Sequence[str], environment: Mapping[str, str], folder: Path, log: Path
     ) -> Program:
-        """Starts one in ``folder``; all it writes goes to the file ``log``. For the main thread, as `end`."""
+        """Starts a program in ``folder``, with its output in the file ``log``. For the main thread, as `end`."""
         package, known = str(Path(flockd.__file__).parents[1]), environment.get("PYTHONPATH")
         with _uninterrupted(), log.open("wb") as file:
             process = subprocess.Popen(
@@ -118,7 +118,7 @@ def _uninterrupted() -> Iterator[None]:
 
 
 def free_port(kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
-    """A port for UDP, unless ``kind`` says another. Raises OSError where none is free."""
+    """A free port of this computer, for UDP unless ``kind`` says TCP. Raises OSError if none is free."""
     for number in itertools.islice(_numbers, COUNT):
         port = FIRST + number % COUNT
         with socket.socket(socket.AF_INET, kind) as probe:

@@ -28,7 +28,7 @@ class FlockPose:
 
 @dataclass(frozen=True, eq=False)
 class FlockMotion:
-    """How all drones move at one time."""
+    """Motion of all drones at one time."""
 
     velocity: FloatArray
     """(n, 3) m/s NED."""
@@ -51,7 +51,7 @@ class PoseTrail:
             self._poses.popleft()
 
     def at(self, time_s: float) -> FlockPose:
-        """The pose at a time, between two that are known; before the first and after the last: that one.
+        """The pose at a time, interpolated between known ones; before the first and after the last: that one.
 
         Raises IndexError where there is none.
         """
@@ -67,7 +67,7 @@ class PoseTrail:
         return FlockPose(time_s, position, before.R_ned_body @ rotation_from_vector(share * _turn(before, after)))
 
     def motion_at(self, time_s: float) -> FlockMotion:
-        """How the flock moves around a time, or just before the newest pose; at rest where only one pose is known."""
+        """Motion of the flock around a time, or just before the newest pose; at rest if only one pose is known."""
         end_s = min(time_s + _BETWEEN_S / 2, self._poses[-1].time_s)
         before, after = self.at(end_s - _BETWEEN_S), self.at(end_s)
         return FlockMotion((after.position - before.position) / _BETWEEN_S, _turn(before, after) / _BETWEEN_S)

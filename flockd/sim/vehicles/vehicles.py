@@ -177,7 +177,7 @@ class Vehicles:
 
     @property
     def known_position(self) -> FloatArray:
-        """(n, 3) m NED, as the autopilots estimate."""
+        """Positions (n, 3) m NED, as the autopilots estimate them."""
         if not self.errors:
             return self.position
         off: FloatArray = np.array([[*of.position, -of.height_m] for of in self.errors])
@@ -185,7 +185,7 @@ class Vehicles:
 
     @property
     def known_velocity(self) -> FloatArray:
-        """(n, 3) m/s NED, as the autopilots estimate."""
+        """Velocities (n, 3) m/s NED, as the autopilots estimate them."""
         if not self.errors:
             return self.velocity
         off: FloatArray = np.array([of.velocity for of in self.errors])
@@ -236,11 +236,11 @@ class EstimateErrors:
 
 
 class SimulatedAutopilot:
-    """What one drone's autopilot reports of its state: the truth with its errors, and noise on barometer and
+    """The state that one drone's autopilot reports: the truth with errors, and noise on barometer and
     gyroscope."""
 
     def __init__(self, config: SensorConfig, *, seed: int, drone: int, ground: Ground = level_ground) -> None:
-        """``ground`` is what its range finder measures to, if it has one."""
+        """``ground``: to which its range finder measures, if it has one."""
         self._config = config
         self._errors = EstimateErrors(config, seed=seed, drone=drone)
         self._random = np.random.default_rng([seed, drone, 1])
@@ -256,7 +256,7 @@ class SimulatedAutopilot:
         turn_rate: FloatArray | None = None,
         errors: EstimateErrors | None = None,
     ) -> VehicleState:
-        """What it says at `time_s`, not before the last, of a drone at `position` (3,) m NED, ground at z = 0.
+        """The report at `time_s`, not before the last one, of a drone at `position` (3,) m NED, ground at z = 0.
 
         Home is the world's origin. `errors`: those that the vehicle is flown with; None: of its own.
         """
@@ -278,7 +278,7 @@ class SimulatedAutopilot:
 
 
 def limit_norms(vectors: FloatArray, most: float) -> FloatArray:
-    """(n, 2), each shorter where it is longer than `most`."""
+    """Vectors (n, 2), shortened to `most` where they are longer."""
     norms = np.linalg.norm(vectors, axis=1, keepdims=True)
     return np.asarray(vectors * np.minimum(1.0, most / np.maximum(norms, 1e-12)), dtype=float)
 
@@ -303,7 +303,7 @@ _MODES = 128
 
 
 class GustField(NamedTuple):
-    """What gusts add to the acceleration of a drone, at each place and time.
+    """The acceleration that gusts add to a drone, by place and time.
 
     An isotropic, incompressible, Gaussian field in three dimensions as a sum of plane waves (R. Kraichnan, "Diffusion
     by a random velocity field", Physics of Fluids 13(1), 1970), which the mean wind carries along as it is (G. Taylor's
@@ -318,7 +318,7 @@ class GustField(NamedTuple):
 
     @classmethod
     def of(cls, vehicle: VehicleConfig, seed: int) -> Self:
-        """The field in which such a vehicle's velocity deviates by `gust_m_s` while its setpoint stays the same."""
+        """The field that makes a vehicle's velocity deviate by `gust_m_s` while its setpoint is constant."""
         if not vehicle.gust_m_s:
             return cls(np.empty((0, 8)))
         random, length_m = np.random.default_rng(seed), vehicle.gust_length_m
@@ -333,7 +333,7 @@ class GustField(NamedTuple):
         return cls(np.column_stack([k, k @ wind_m_s, across[0, :, :2], across[1, :, :2]]))
 
     def push(self, time_s: float, positions: FloatArray) -> FloatArray:
-        """(n, 2) m/s^2 north and east at places (n, 3) m NED."""
+        """Accelerations (n, 2) m/s^2 north and east at places (n, 3) m NED."""
         phase = positions @ self.waves[:, :3].T - time_s * self.waves[:, 3]
         pushes: FloatArray = np.cos(phase) @ self.waves[:, 4:6] + np.sin(phase) @ self.waves[:, 6:]
         return pushes

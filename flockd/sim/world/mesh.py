@@ -18,7 +18,7 @@ Tile = tuple[float, float]
 
 
 def unit(v: FloatArray) -> FloatArray:
-    """Vectors (..., 3) at length 1."""
+    """Vectors (..., 3), scaled to length 1."""
     return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True))
 
 
@@ -58,7 +58,7 @@ def face_normals(vertices: FloatArray, triangles: IntArray | NDArray[np.int32]) 
 
 
 class Mesh:
-    """Triangles as they are collected, numbered from ``first_vertex``."""
+    """Collects triangles; vertices are numbered from ``first_vertex``."""
 
     def __init__(self, first_vertex: int = 0) -> None:
         self.vertices: list[FloatArray] = []

@@ -32,7 +32,7 @@ class _Look(NamedTuple):
 
 
 def draw_obstacles(scenery: Scenery, obstacles: Obstacles, seed: int) -> None:
-    """Adds their triangles, textures and footprints to a scenery, with colours drawn from the seed."""
+    """Adds the obstacles' triangles, textures and footprints to a scenery, with colours drawn from the seed."""
     rng = np.random.default_rng([seed, 4])
     looks = {
         material: [_look(scenery, rng, material) for _ in range(_LOOKS)]

@@ -229,7 +229,7 @@ def _wire(one: FloatArray, other: FloatArray, *, sag: float) -> list[Solid]:
 
 
 def with_obstacles(log: FlightLog, scenario: ScenarioConfig) -> FlightLog:
-    """The log of a scenario's flight with its obstacles and clearances; as it was where there are none."""
+    """The log of a scenario's flight with its obstacles and clearances; unchanged if there are no obstacles."""
     obstacles = obstacles_of(scenario)
     if not obstacles.solids:
         return log
@@ -242,7 +242,7 @@ def with_obstacles(log: FlightLog, scenario: ScenarioConfig) -> FlightLog:
 
 
 def clearances(obstacles: Obstacles, times: FloatArray, position: FloatArray, velocity: FloatArray) -> FloatArray:
-    """(S, N) m: the smallest clearance from each of the times (S,) to the next, of (S, N, 3) m and m/s NED.
+    """Smallest clearances (S, N) m from each of the times (S,) s to the next, of drones at (S, N, 3) m and m/s NED.
 
     Between them each drone is taken to fly on the cubic through both states.
     """

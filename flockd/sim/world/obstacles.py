@@ -163,7 +163,7 @@ class Obstacles:
         self, position: FloatArray, azimuths: FloatArray, height_band: tuple[float, float] = HEIGHT_BAND_M, *,
         half_width: float = 0.0, limit_m: float = math.inf,
     ) -> FloatArray:  # fmt: skip
-        """(n,) level metres from `position` (3,) NED to the nearest solid at each of the azimuths; inf without one.
+        """Level distances (n,) m from `position` (3,) NED to the nearest solid at each azimuth; inf without one.
 
         Azimuths (n,) are rad clockwise from north. Of each solid the part counts whose height above the drone lies in
         `height_band`, seen from above. With `half_width` (rad) it is the nearest point of the sector around each
@@ -179,7 +179,7 @@ class Obstacles:
         return np.where(found > limit_m, math.inf, found)
 
     def clearance(self, points: FloatArray) -> FloatArray:
-        """(...) metres from points (..., 3) NED to the nearest surface, negative inside; inf without any."""
+        """Distances (...) m from points (..., 3) NED to the nearest surface, negative inside; inf without solids."""
         flat = np.asarray(points, dtype=float).reshape(-1, 3)
         nearest = np.full(len(flat), math.inf)
         for solid, around, reach in zip(self.solids, self._around, self._reach, strict=True):
@@ -226,7 +226,7 @@ def _sector_ranges(shapes: FloatArray, place: FloatArray, azimuths: FloatArray, 
 def true_ranges(
     obstacles: Obstacles, time_s: float, position: FloatArray, *, limit_m: float = RANGE_LIMIT_M
 ) -> ObstacleRanges:
-    """What a drone at `position` (3,) NED would measure without errors: all around, up to `limit_m`."""
+    """The ranges that a drone at `position` (3,) m NED would measure without errors, all around, up to `limit_m`."""
     azimuths = np.arange(SECTORS, dtype=float) * (2 * math.pi / SECTORS)
     range_m = obstacles.ranges(position, azimuths, half_width=math.pi / SECTORS, limit_m=limit_m)
     sigma_m = np.where(np.isfinite(range_m), EXACT_SIGMA_M, 0.0)

@@ -22,7 +22,7 @@ metre, phase, kind, style (0 track, 1 path, 2 marked); of ``patches``: a centre,
 
 
 class Scenery:
-    """One world's things, in a fixed order of draws. Read its attributes, change none.
+    """The objects of one world, drawn in a fixed order. Its attributes are for reading only.
 
     ``textures``: the ground's kinds first. ``obstacles`` as in ``World``.
     """
@@ -313,7 +313,7 @@ class Scenery:
 
 
 def footprint_distance(obstacles: FloatArray, points: FloatArray) -> FloatArray:
-    """Horizontal metres (n,) from points (n, 2) to the nearest of the rectangles; 0 inside."""
+    """Horizontal distances (n,) m from points (n, 2) to the nearest of the rectangles; 0 inside."""
     nearest = np.full(len(points), np.inf)
     for north, east, half_length, half_width, heading, _ in obstacles:
         dn, de = points[:, 0] - north, points[:, 1] - east

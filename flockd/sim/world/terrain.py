@@ -38,7 +38,7 @@ def _waves(rng: Generator, axis: FloatArray, count: int, lengths_m: tuple[float,
 
 
 def grid_height(heights: FloatArray, extent: float, north: FloatArray, east: FloatArray) -> FloatArray:
-    """Metres at points (n,), on the two triangles of each cell; 0 beyond the grid."""
+    """Heights (n,) m at points (n,) m north and east, on the two triangles of each cell; 0 beyond the grid."""
     cells = heights.shape[0] - 1
     fn = (north / extent + 1.0) * 0.5 * cells
     fe = (east / extent + 1.0) * 0.5 * cells

@@ -117,11 +117,11 @@ class World:
         )
 
     def height_at(self, north: FloatArray, east: FloatArray) -> FloatArray:
-        """(n,) metres of ground above z = 0 (z = -height), on the very triangles drawn; 0 beyond the extent."""
+        """Heights (n,) m of the ground above z = 0, on the triangles that are drawn; 0 beyond the extent."""
         return terrain.grid_height(self.ground_heights, self.extent_m, north, east)
 
     def obstacle_distance(self, points: FloatArray) -> FloatArray:
-        """(n,) horizontal metres from points (n, 2) to the nearest obstacle's footprint; 0 inside one."""
+        """Horizontal distances (n,) m from points (n, 2) to the nearest obstacle's footprint; 0 inside one."""
         return footprint_distance(self.obstacles, points)
 
     def free_points(

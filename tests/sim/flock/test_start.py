@@ -32,8 +32,3 @@ def test_a_larger_flock_keeps_the_given_and_stands_apart(count: int) -> None:
     assert {vehicle.velocity_m_s for vehicle in vehicles} == {(1.0, 0.0)}
     # Dense enough to be one flock: within the disc that the same number fills at twice the spacing.
     assert max(math.dist(place[:2], (1.92, 0.9)) for place in places) < 7.0 * math.sqrt(count / math.pi) + 7.0
-
-
-def test_an_empty_flock_is_refused() -> None:
-    with pytest.raises(ValueError, match="at least 1"):
-        with_drones(PAPER, 0)
