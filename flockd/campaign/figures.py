@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 from pydantic import AfterValidator, Field
 from pydantic_core import PydanticCustomError
-from scipy.special import ndtri, stdtrit
+from scipy.special import stdtrit
 
 from flockd.core.messages import FloatArray
 from flockd.review.flight_log.log import FlightLog
@@ -48,10 +48,10 @@ def mean_interval(values: Sequence[float], *, is_share: bool = False) -> Interva
         return None
     mean = float(np.mean(values))
     if is_share:
-        z = float(ndtri(_UPPER_END))
-        middle = (mean + z * z / (2 * n)) / (1 + z * z / n)
-        reach = z / (1 + z * z / n) * math.sqrt(mean * (1 - mean) / n + z * z / (4 * n * n))
-        return Interval(mean, max(middle - reach, 0.0), min(middle + reach, 1.0))
+        from scipy.stats import binomtest  # noqa: PLC0415 - heavy
+
+        found = binomtest(int(sum(values)), n).proportion_ci(method="wilson")
+        return Interval(mean, float(found.low), float(found.high))
     reach = float(stdtrit(n - 1, _UPPER_END)) * float(np.std(values, ddof=1)) / math.sqrt(n)
     return Interval(mean, mean - reach, mean + reach)
 

@@ -8,6 +8,7 @@ taken over the axes given.
 from __future__ import annotations
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from flockd.core.config.flocking import FlockingParameters
 from flockd.core.messages import BoolArray, FloatArray
@@ -55,11 +56,8 @@ def union(positions: FloatArray, interaction_distance_m: float) -> float:
     n = len(positions)
     if n < 2:
         return 1.0
-    reach = _adjacency(pair_distances(positions), interaction_distance_m) | np.eye(n, dtype=bool)
-    for _ in range(n.bit_length()):  # paths of twice the length with each squaring
-        reach = reach @ reach
-    components = len(np.unique(reach, axis=0))
-    return (n - components) / (n - 1)
+    components, _ = connected_components(_adjacency(pair_distances(positions), interaction_distance_m), directed=False)
+    return (n - int(components)) / (n - 1)
 
 
 def safety(positions: FloatArray, collision_radius_m: float = 0.5) -> float:
