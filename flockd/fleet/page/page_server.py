@@ -34,7 +34,6 @@ MAX_PAGES = 32
 """Largest number of open pages."""
 HELLO_S = 5.0
 """Time for a page to send its token."""
-_ORDER_THREADS = 64
 _TOKEN = "@TOKEN@"
 """Placeholder in the page for the session's token."""
 
@@ -61,8 +60,9 @@ class PageServer:
             simulation: controls of a simulation; None: real drones.
         """
         self._source, self._access, self._may_command, self._operator = source, access, may_command, operator
-        self._order_threads = ThreadPoolExecutor(_ORDER_THREADS, "orders of the fleet page")
-        """Threads for orders only."""
+        self._order_threads = ThreadPoolExecutor(MAX_DRONES, "orders of the fleet page")
+        self._silent_threads = ThreadPoolExecutor(MAX_DRONES, "orders to silent drones")
+        """For drones that did not answer last: an order waits for them for seconds, and no other drone's may."""
         self._pictures = PagePictures(source.image, EVERY_S if simulation is None else OF_SIMULATION_S)
         self._pages, self._simulation = 0, simulation
         self.trusted: set[object] = set()
@@ -159,12 +159,13 @@ class PageServer:
             return _text(400, str(error))
         operator = self._operator_of(request)
         loop, known = asyncio.get_running_loop(), self._source.known()
-        # Those that never answer come last, where there are more than threads.
-        drones.sort(key=lambda drone: known.get(drone, Known()).delay_s is None)
+        silent = {drone for drone in drones if known.get(drone, Known()).delay_s is None}
+        pools = [self._silent_threads if drone in silent else self._order_threads for drone in drones]
+        ask = self._source.ask
         answers = await asyncio.gather(
             *(
-                loop.run_in_executor(self._order_threads, self._source.ask, drone, command, order, operator)
-                for drone in drones
+                loop.run_in_executor(pool, ask, drone, command, order, operator)
+                for pool, drone in zip(pools, drones, strict=True)
             )
         )
         told: dict[str, AnswerMessage] = dict(zip(drones, answers, strict=True))

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 import pytest
 from aiohttp import web
 
-from flockd.fleet.drone_rows import Row
+from flockd.fleet.drone_rows import Known, Row
 from flockd.fleet.page.page_access import MAX_STRANGERS, STRANGER_S, PageAccess, PageConnections
 from flockd.fleet.page.page_server import EVERY_S, OF_SIMULATION_S, SILENT_S, PagePictures, PageServer
 from flockd.onboard.telemetry.topics import AnswerMessage
@@ -19,12 +19,15 @@ pytestmark = pytest.mark.fault("stuck-pictures")
 
 
 class Stuck(Asked):
-    """Cameras of "f/silent" never give a picture; what happened is noted in order."""
+    """Cameras never give a picture, and only "f/one" answers orders; what happened is noted in order."""
 
     def __init__(self) -> None:
         super().__init__()
         self.happened: list[str] = []
         self.answers = threading.Event()
+
+    def known(self) -> Mapping[str, Known]:
+        return {"f/one": Known(delay_s=0.01)}
 
     def image(self, drone: str, camera: str) -> bytes | None:
         self.happened.append("asked for a picture")
@@ -33,14 +36,14 @@ class Stuck(Asked):
         return None
 
     def ask(self, drone: str, command: str, order: Mapping[str, object] | None, operator: str) -> AnswerMessage:
-        if drone == "f/silent":
+        if drone != "f/one":
             self.answers.wait(60.0)
         self.happened.append(f"{drone} answered")
         return AnswerMessage(accepted=True, sentence="tried")
 
 
 async def test_an_order_passes_pictures_and_orders_that_nobody_answers() -> None:
-    """Twenty-four pictures for each of four pages, and a hold that hangs: the other drone's answer comes first."""
+    """Twenty-four pictures for each of four pages, and 250 orders that hang: the other drone's answer comes first."""
     fleet = Stuck()
     async with served(fleet=fleet) as (client, access, _):
         own = await opened(client, access)
@@ -50,18 +53,18 @@ async def test_an_order_passes_pictures_and_orders_that_nobody_answers() -> None
             for drone in ("silent", "other")
             for number in range(12)
         ]
-        hanging = {"drones": ["f/silent"], "command": "hold"}
-        stuck = asyncio.create_task(client.post("/ask", json=hanging, headers=own))
+        hanging = {"drones": [f"f/silent{number}" for number in range(50)], "command": "hold"}
+        stuck = [asyncio.create_task(client.post("/ask", json=hanging, headers=own)) for _ in range(5)]
         while "asked for a picture" not in fleet.happened:
             await asyncio.sleep(0.01)
         reply = await client.post("/ask", json={"drones": ["f/one"], "command": "hold"}, headers=own)
         assert (await reply.json())["f/one"]["accepted"]
         assert {(await picture).status for picture in pictures} == {204}, "none waits for its drone"
         assert "a picture came" not in fleet.happened
-        assert not stuck.done()
+        assert not any(one.done() for one in stuck)
         assert fleet.happened.count("asked for a picture") == 8, "four of each drone, whoever looks"
         fleet.answers.set()
-        await stuck
+        await asyncio.gather(*stuck)
     assert fleet.happened.index("f/one answered") < fleet.happened.index("a picture came")
 
 
