@@ -42,6 +42,7 @@ REPEAT_S = 1.0
 """Half of the time for which an operator's velocity holds."""
 FIND_S, AGAIN_S = 3.0, 0.1
 NO_ANSWER = "did not answer; this computer may not command it"
+ENDED = "has ended, or cannot be reached any more; see `flockd status`"
 PLAIN = {
     "hold": "Make the drones' autopilots hold position: the drones stop, and flockd hands over.",
     "land": "Make the drones' autopilots land them where they are.",
@@ -166,6 +167,8 @@ def _ask(args: argparse.Namespace, command: str, order: MissionOrder | None = No
         while not over.is_set():
             reply = watcher.ask(drone, command, args.operator, message)
             answer = {"accepted": False, "sentence": NO_ANSWER} if reply is None else {**reply}
+            if reply is None and drone not in _alive(watcher):
+                answer["sentence"] = ENDED
             if answer != answers.get(drone) and not args.json:
                 (say if answer["accepted"] else complain)(f"{drone}: {answer['sentence']}")
             answers[drone] = answer
@@ -196,14 +199,17 @@ def _found(watcher: FleetWatcher, names: list[str]) -> Iterator[str]:
     found: set[str] = set()
     until_s = time.monotonic() + FIND_S
     while True:
-        alive = {
-            f"{one.fleet}/{one.drone}" for one in watcher.drones() if one.alive and (one.drone in names or not names)
-        }
+        alive = {key for key in _alive(watcher) if not names or key.partition("/")[2] in names}
         yield from sorted(alive - found)
         found |= alive
         if time.monotonic() >= until_s or (names and not _missing(names, found)):
             return
         time.sleep(AGAIN_S)
+
+
+def _alive(watcher: FleetWatcher) -> set[str]:
+    """Keys `fleet/drone` of the drones whose processes run and can be reached."""
+    return {f"{one.fleet}/{one.drone}" for one in watcher.drones() if one.alive}
 
 
 def _missing(names: list[str], drones: Iterable[str]) -> list[str]:

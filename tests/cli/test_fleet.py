@@ -5,13 +5,16 @@ from __future__ import annotations
 import socket
 import subprocess
 import sys
+import time
 from argparse import Namespace
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
 
+from flockd.cli import main
 from flockd.cli.fleet import _found, announce
 from flockd.fleet.watcher import FleetWatcher
 from flockd.onboard.telemetry.publisher import ZenohTelemetry
@@ -78,6 +81,23 @@ def test_a_hold_reaches_each_whatever_the_others_do() -> None:
     ]
     assert [line.partition(" at ")[0] for line in rest[2:]] == ["drone4 was not found"]
     assert hold.returncode == 1
+
+
+def test_an_order_that_is_repeated_says_that_the_flight_has_ended(capsys: pytest.CaptureFixture[str]) -> None:
+    endpoint = free_endpoint()
+    drone = _drone("drone1", endpoint, lost=False)
+    told = capsys.readouterr
+
+    def ended() -> None:
+        while "it is tried" not in told().out:
+            time.sleep(0.05)
+        drone.kill()
+        drone.communicate()
+
+    with ThreadPoolExecutor() as threads:
+        threads.submit(ended)
+        assert main(["fleet", "velocity", "all", "0.5", "0", "--seconds", "6", "--connect", endpoint]) == 1
+    assert told().err.splitlines() == ["meadow/drone1: has ended, or cannot be reached any more; see `flockd status`"]
 
 
 def test_a_drone_is_asked_when_it_is_found_and_not_after_a_while(monkeypatch: pytest.MonkeyPatch) -> None:
