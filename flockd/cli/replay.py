@@ -257,13 +257,13 @@ def _add_dataset(parser: Parser) -> None:
 
 def _run_dataset(args: argparse.Namespace) -> int:
     """Runs the command for a dataset."""
-    refuse(args, _OF_RECORDINGS, "is for recordings of flockd, and this is not one; leave it out")
     from flockd.ground.datasets.image_folder import open_dataset
     from flockd.review.replay.dataset_flight import dataset_config, dataset_result, replay_dataset
 
     stride = args.stride or 1
     depth: Depth = args.depth or "network"
     dataset = open_dataset(args.recording)
+    refuse(args, _OF_RECORDINGS, "is for recordings of flockd, and this is not one; leave it out")
     if depth == "recorded" and not dataset.has_depth:
         raise UsageError(f"{dataset.path}: has no recorded depth; replay it with --depth network")
     if stride >= len(dataset):

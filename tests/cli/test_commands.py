@@ -96,6 +96,7 @@ def test_version(told: Told) -> None:
             "flockd replay",
             "--tolerance: velocity is given twice; leave one out",
         ),
+        (["doctor", "--bench", "--demo", "--seconds", "0.2"], "flockd doctor", "--seconds: '0.2' is not a number of"),
         (["sim", "--duration", "-3"], "flockd sim", "--duration: '-3'"),
         (["sim", "--duration", "nan"], "flockd sim", "--duration: 'nan'"),
         (["sim", "--drones", "0"], "flockd sim", "--drones: '0'"),

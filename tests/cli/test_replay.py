@@ -148,6 +148,11 @@ def test_other_settings_can_be_tried(path: Path, told: Told) -> None:
     assert error.startswith(f"{file}: rig.cameras: camera 'left' has 164 x 124 pixels, but {path} ")
 
 
+def test_a_flights_folder_names_its_recordings(path: Path, told: Told) -> None:
+    told_of = told(1, "replay", path.parent, "--diff")
+    assert told_of.startswith(f"{path.parent}: is a folder of recordings; name one, as in `flockd replay {path}`")
+
+
 def test_a_reference_takes_no_other_files_place(path: Path, told: Told) -> None:
     recording = path.read_bytes()
     refused = told(2, "replay", path, "--reference", path, "--update-reference")

@@ -75,8 +75,9 @@ def open_dataset(path: Path) -> Dataset:
     """The images in a folder. Raises DatasetError, and ConfigError for a calibration that cannot be used."""
     if not (path / "images").is_dir():
         advice = "is no folder of images; it needs images/, and K.txt with the camera's matrix"
-        if any(file.suffix in {".mcap", ".db3"} for file in path.iterdir()):
-            advice = "has no metadata.yaml of a bag, which `ros2 bag reindex` writes; or name a recording in it"
+        if recordings := in_order(file for file in path.rglob("*") if file.suffix in {".mcap", ".db3"}):
+            advice = f"is a folder of recordings; name one, as in `flockd replay {recordings[0]}`"
+            advice += ", or write the metadata.yaml of a bag with `ros2 bag reindex`"
         raise DatasetError(f"{path}: {advice}")
     images = _files(path / "images")
     camera = read_calibration(path / "K.txt", read_image(images[0]).shape[1::-1])

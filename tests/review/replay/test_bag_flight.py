@@ -277,7 +277,7 @@ def test_a_part_of_a_bag_is_told_to_be_one(tmp_path: Path, capsys: pytest.Captur
         assert told in capsys.readouterr().err
     (theirs / "metadata.yaml").unlink()
     assert main(["replay", str(theirs)]) == 1
-    assert "has no metadata.yaml of a bag, which `ros2 bag reindex` writes" in capsys.readouterr().err
+    assert "write the metadata.yaml of a bag with `ros2 bag reindex`" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("topic", ["/fmu/out/vehicle_odometry", "/own"])
