@@ -33,8 +33,8 @@ def add(commands: Commands) -> None:
     _add_import(commands)
 
 
-def _add_shared(parser: Parser) -> None:
-    option(parser, "--out FILE", "write the result to this file (CAMERA.yaml or rig.yaml)", Path)
+def _add_shared(parser: Parser, out: str = "rig.yaml") -> None:
+    option(parser, "--out FILE", f"write the result to this file (default: {out})", Path)
     flag(parser, "--force", "overwrite existing files")
     flag(parser, "--json", "print the result as JSON")
 
@@ -60,16 +60,15 @@ def _add_camera(commands: Commands) -> None:
     )
     description = "Measure a camera's lens from views of a ChArUco board."
     parser = commands("camera", description, examples, _camera)
-    help_of_source = "a folder of images; by default --config's own camera, live"
-    option(parser, "SOURCE", help_of_source, nargs="?")
+    option(parser, "SOURCE", "a folder of images (default: the live camera of --config)", nargs="?")
     option(parser, "--camera NAME", "the camera's name in the rig")
-    option(parser, "--model", "default: pinhole, unless the other fits clearly better", choices=LENS_MODELS)
+    option(parser, "--model", "lens model (default: the simplest that fits)", choices=LENS_MODELS)
     option(parser, "--print-board FILE", "write the board to print (.svg)", Path)
     option(parser, "--config FILE", "the drone whose camera is used", Path)
-    _add_shared(parser)
+    _add_shared(parser, "CAMERA.yaml")
     board = parser.add_argument_group("the board", "as it was printed; measure it, printers shrink")
-    option(board, "--squares CxR", "columns x rows (7x5)", size, default=(7, 5))
-    option(board, "--square-mm MM", "side of a square (36)", positive_number, default=36.0)
+    option(board, "--squares CxR", "columns x rows (default: 7x5)", size, default=(7, 5))
+    option(board, "--square-mm MM", "side of a square, mm (default: 36)", positive_number, default=36.0)
     flag(board, "--legacy", "the board was made by OpenCV before 4.6")
 
 
@@ -159,7 +158,7 @@ def _add_rig(commands: Commands) -> None:
     """Adds the command."""
     description = "Correct the rig by a recorded flight: the cameras' mountings, time offset and focal lengths."
     parser = commands("rig", description, ("flockd calibrate rig --from-flight drone1.mcap",), _rig)
-    option(parser, "--from-flight RECORDING", "the flight", Path, required=True)
+    option(parser, "--from-flight RECORDING", "a recording of the flight, with its images", Path, required=True)
     _add_shared(parser)
 
 

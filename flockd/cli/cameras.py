@@ -36,12 +36,12 @@ def add(commands: Commands) -> None:
     description = "List the cameras of this computer, measure their images, and write their configuration."
     parser = commands("cameras", description, examples, _run)
     option(parser, "--picture FOLDER", "run all cameras, measure their images, and save one of each", Path)
-    option(parser, "--seconds S", f"measure this long ({SECONDS:g})", duration, default=SECONDS)
-    option(parser, "--size WxH", "image size; the nearest one available is used", size, default=(640, 480))
-    option(parser, "--write FILE", "write the sections `rig` and `source` for them", Path)
+    option(parser, "--seconds S", f"measure for S seconds (default: {SECONDS:g})", duration, default=SECONDS)
+    option(parser, "--size WxH", "image size, or the nearest there is (default: 640x480)", size, default=(640, 480))
+    option(parser, "--write FILE", "write the configuration's sections `rig` and `source` for these cameras", Path)
     told = "turn their images clockwise until they are upright: 90 for cameras on their sides, tops to the right"
     option(parser, "--turn-deg", told, int, choices=(0, 90, 180, 270), default=0)
-    option(parser, "--names NAME", "names of the cameras in the rig, in the listed order", nargs="+")
+    option(parser, "--names NAME", "names of the cameras in the rig, in the order of the list", nargs="+")
     flag(parser, "--force", "overwrite the file if it exists")
     flag(parser, "--json", "print JSON")
 

@@ -44,8 +44,8 @@ def add(commands: Commands) -> None:
     )
     parser = commands(RUN, "Fly the missing flights of a campaign, and write its report.", examples, _run, notes=COSTS)
     option(parser, "FILE", "the campaign's file", Path)
-    option(parser, "--out FOLDER", "default: out/NAME, with the campaign's name", Path)
-    option(parser, "--workers N", "flights at once (default: processors)", positive_count)
+    option(parser, "--out FOLDER", "folder of the results (default: out/NAME, by the campaign's name)", Path)
+    option(parser, "--workers N", "flights at once (default: one a processor)", positive_count)
     flag(parser, "--dry-run", "print the number of flights and hours; fly and write nothing")
     flag(parser, "--json", "print what was flown as JSON")
     examples = (
@@ -53,16 +53,16 @@ def add(commands: Commands) -> None:
         "flockd campaign rerun out/night/c0-s7 --out out/why --json",
     )
     parser = commands("rerun", "Fly one flight of a campaign again, with its full report.", examples, _rerun)
-    parser.add_argument("flight", metavar="RUN", type=Path, help="the campaign's folder and the flight's name")
-    option(parser, "--out DIR", "default: FOLDER/reruns/NAME", Path)
+    parser.add_argument("flight", metavar="RUN", type=Path, help="the campaign's folder, and the flight's name in it")
+    option(parser, "--out DIR", "folder of the report (default: FOLDER/reruns/NAME)", Path)
     flag(parser, "--force", "overwrite an earlier flight in that folder")
     flag(parser, "--json", "print the summary as JSON")
     parser.set_defaults(quiet=False)
     examples = ("flockd campaign report out/separation", "flockd campaign report out/old_networks out/new_networks")
     parser = commands("report", "Write the report of a campaign, or compare a second one with it.", examples, _report)
     option(parser, "FOLDER", "a campaign's folder", Path)
-    option(parser, "OTHER", "compare this campaign with FOLDER: is it better?", Path, nargs="?")
-    option(parser, "--out FILE", "default: report.html in the folder", Path)
+    option(parser, "OTHER", "a second campaign's folder: are its figures better than FOLDER's?", Path, nargs="?")
+    option(parser, "--out FILE", "file of the report (default: report.html in FOLDER)", Path)
     flag(parser, "--json", "print the figures as JSON")
 
 

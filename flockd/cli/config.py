@@ -31,10 +31,10 @@ def add(commands: Commands) -> None:
         "flockd config show config/simulator.yaml",
         "flockd config new scenario my_flight.yaml --set duration_s=30",
     )
-    commands = commands_of(commands("config", "Check, show, describe and begin configuration files.", examples))
+    commands = commands_of(commands("config", "Check, show, describe and write configuration files.", examples))
     examples = ("flockd config check my_flight.yaml", "flockd config check --json config/*.yaml")
     parser = commands("check", "Report all errors in files of drones, scenarios and campaigns.", examples, _check)
-    parser.add_argument("files", nargs="+", metavar="FILE", type=Path, help="of drones, scenarios or campaigns")
+    parser.add_argument("files", nargs="+", metavar="FILE", type=Path, help="a drone's, scenario's or campaign's file")
     flag(parser, "--json", "print the problems as JSON")
     add_force(parser)
     examples = ("flockd config show config/paper_flight.yaml", "flockd config show --json config/simulator.yaml")
@@ -55,7 +55,7 @@ def add(commands: Commands) -> None:
     description = "Write a commented file of a real drone or a simulated flight, to be filled in."
     parser = commands("new", description, examples, _new)
     parser.add_argument("kind", choices=("drone", "scenario"), help="kind of file")
-    option(parser, "FILE", "to write", Path)
+    option(parser, "FILE", "the file to write", Path)
     flag(parser, "--force", "overwrite the file if it exists")
     add_settings(parser, "write this value")
 

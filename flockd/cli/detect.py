@@ -55,7 +55,7 @@ def add(commands: Commands) -> None:
     option(
         parser,
         "--min-probability P",
-        "leave out less probable detections (0)",
+        "leave out less probable detections (default: 0)",
         number("a probability, 0 to 1", 0, 1),
         default=0.0,
     )
@@ -65,7 +65,7 @@ def add(commands: Commands) -> None:
         "size of every drone, from tip to tip, if known",
         number("a size in metres, 0.05 to 5", 0.05, 5),
     )
-    option(parser, "--every N", "every Nth frame of a video (1)", positive_count, default=1)
+    option(parser, "--every N", "look at every Nth frame of a video (default: 1)", positive_count, default=1)
     flag(parser, "--json", "print the result as JSON")
     camera = parser.add_argument_group("the camera of the pictures")
     option(

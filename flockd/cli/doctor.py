@@ -48,12 +48,13 @@ def add(commands: Commands) -> None:
     )
     parser = commands("doctor", description, examples, _run)
     option(parser, "--config FILE", "the drone's configuration; with --demo by default the simulator's", Path)
-    option(parser, "--record DIR", "the folder in which `flockd run` will record", Path)
+    option(parser, "--record DIR", "check this folder, in which `flockd run` will record", Path)
     seconds = number(f"a number of seconds from {LEAST_S:g} to 3600", LEAST_S, 3600)
-    option(parser, "--seconds S", f"watch the cameras this long ({SECONDS:g}), or fly the bench", seconds)
+    told = f"watch the cameras for S seconds (default: {SECONDS:g}), or fly the bench so long (default: 15)"
+    option(parser, "--seconds S", told, seconds)
     option(parser, "--only CHECK", f"run only this check, one of {', '.join(CHECKS)}", action="append", choices=CHECKS)
     flag(parser, "--bench", "run the daemon and time its steps; needs --demo, and the extra `sim`")
-    flag(parser, "--demo", "without hardware: with a simulated autopilot and rendered images")
+    flag(parser, "--demo", "use a simulated autopilot and rendered images instead of hardware")
     flag(parser, "--json", "print JSON")
     add_force(parser)
 

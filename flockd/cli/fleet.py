@@ -93,14 +93,14 @@ def _add_orders(commands: Commands) -> None:
     flag(parser, "--degrees", "read NORTH and EAST as latitude and longitude")
     option(parser, "--height M", "height above the ground at home (default: the present one)", _number)
     option(parser, "--speed V", "in m/s (default: the mission's)", positive_number)
-    flag(parser, "--repeat", "send it every second until Ctrl-C")
+    flag(parser, "--repeat", "send the goal every second until Ctrl-C")
     examples = ("flockd fleet velocity drone1 0.5 0 --seconds 10", "flockd fleet velocity all 0 -1 --height 6")
-    what = "Make drones fly at a velocity while it is sent."
+    what = "Make drones fly at a velocity: they stop two seconds after it was last sent."
     parser = _ordering(commands("velocity", what, examples, _velocity))
     option(parser, "NORTH", "m/s to the north", _number)
     option(parser, "EAST", "m/s to the east", _number)
     option(parser, "--height M", "height above the ground at home (default: the present one)", _number)
-    option(parser, "--seconds S", "send it every second for S seconds (default: once)", duration)
+    option(parser, "--seconds S", "send the velocity every second for S seconds (default: once)", duration)
     for command, what in PLAIN.items():
         examples = (f"flockd fleet {command} all", f"flockd fleet {command} drone1")
         _ordering(commands(command, what, examples, functools.partial(_ask, command=command)))

@@ -24,7 +24,7 @@ def add(commands: Commands) -> None:
     examples: tuple[str, ...] = (
         "flockd models list", "flockd models verify", "flockd models prepare --config my_drone.yaml", _IMPORT
     )  # fmt: skip
-    commands = commands_of(commands("models", "List, verify and prepare the networks.", examples))
+    commands = commands_of(commands("models", "List, verify, prepare and import networks.", examples))
     examples = ("flockd models list", "flockd models list --json", "flockd models list --dir my_models")
     _add_options(commands("list", "List each model with its roles; a damaged one is refused.", examples, _list))
     examples = ("flockd models verify", "flockd models verify --json")
@@ -45,18 +45,15 @@ def add(commands: Commands) -> None:
     parser = commands("import", description, (_IMPORT,), _import)
     option(parser, "FILE", "the ONNX file", Path)
     option(parser, "--drone CLASS", "the class of drones, by its name in FILE or its number from 0", required=True)
-    option(
-        parser,
-        "--licence TEXT",
-        "of its weights, for the manifest; Ultralytics' are AGPL-3.0, and so are yours by them",
-    )
-    option(parser, "--out FOLDER", "where network and manifest go (my_models)", Path, default=Path("my_models"))
+    told = "licence of the weights, for the manifest; networks trained with Ultralytics are under AGPL-3.0"
+    option(parser, "--licence TEXT", told)
+    option(parser, "--out FOLDER", "folder to write into (default: my_models)", Path, default=Path("my_models"))
     flag(parser, "--force", "overwrite existing files")
     flag(parser, "--json", "print JSON")
 
 
 def _add_options(parser: Parser) -> Parser:
-    option(parser, "--dir", "folder of the manifests; by default the one that comes with flockd", Path)
+    option(parser, "--dir", "folder of the manifests (default: flockd's own)", Path)
     flag(parser, "--json", "print JSON")
     return parser
 

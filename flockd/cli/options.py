@@ -26,10 +26,11 @@ LONGEST_OPERATOR = 40
 
 def add_endpoint_options(parser: Parser, listen: str = "--listen") -> None:
     """Adds the fleet's name and the endpoints; ``listen``: the option for the endpoint at which it listens."""
-    option(parser, "--fleet NAME", "watch only this fleet; by default all that are found", _fleet)
-    option(parser, "--connect ENDPOINT", f"connect to this drone or router; by default {ENDPOINT}", action="append")
-    parser.add_argument(listen, metavar="ENDPOINT", action="append", dest="drones_at", help="listen here for drones")
-    option(parser, "--zenoh-config FILE", "a file of zenoh's settings, for example for TLS", Path)
+    option(parser, "--fleet NAME", "only the drones of this fleet (default: of every fleet that is found)", _fleet)
+    option(parser, "--connect ENDPOINT", f"connect to this drone or router (default: {ENDPOINT})", action="append")
+    told = "listen here for drones that connect to this computer"
+    option(parser, f"{listen} ENDPOINT", told, action="append", dest="drones_at")
+    option(parser, "--zenoh-config FILE", "zenoh's own configuration file, for example for TLS", Path)
 
 
 def _fleet(text: str) -> str:
@@ -100,8 +101,8 @@ def require(*paths: Path) -> None:
 
 def add_stretch(parser: Parser) -> None:
     """Adds --start and --end, in seconds from the recording's first step."""
-    option(parser, "--start S", "seconds from the first step", number("a number, 0 or more", 0), default=0.0)
-    option(parser, "--end S", "seconds from the first step", positive_number)
+    option(parser, "--start S", "begin S seconds after the first step", number("a number, 0 or more", 0), default=0.0)
+    option(parser, "--end S", "end S seconds after the first step", positive_number)
 
 
 def stretch(recording: Recording, args: argparse.Namespace) -> tuple[float, float]:

@@ -42,11 +42,11 @@ def add(commands: Commands) -> None:
     option(parser, "RECORDING", "a recording, or a dataset (see below)", Path)
     add_stretch(parser)
     option(parser, "--config FILE", "use the settings of this drone or scenario", Path)
-    option(parser, "--out FILE", "write a new recording", Path)
+    option(parser, "--out FILE", "write the replay as a new recording (.mcap)", Path)
     flag(parser, "--diff", "compare every output with the recorded one")
     flag(parser, "--profile", "show where time goes on this computer, and which step_s it can keep")
-    option(parser, "--reference FILE", "compare with this file instead", Path)
-    flag(parser, "--update-reference", "write the outputs to the reference")
+    option(parser, "--reference FILE", "with --diff: compare with the outputs in this file instead", Path)
+    flag(parser, "--update-reference", "write the outputs to the file of --reference")
     option(
         parser,
         "--tolerance FIELD=X",

@@ -36,7 +36,7 @@ def add(commands: Commands) -> None:
 
 
 def _add_network(parser: Parser) -> None:
-    flag(parser, "--network", "let other computers find it in ROS 2 (default: only this one)")
+    flag(parser, "--network", "let ROS 2 nodes on other computers find it (default: only those on this one)")
 
 
 def _add_perceive(commands: Commands) -> None:

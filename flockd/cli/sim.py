@@ -70,7 +70,7 @@ def add(commands: Commands) -> None:
         "flockd sim config/px4_flight.yaml --autopilot px4",
     )
     parser = commands("sim", "Fly a simulated flock, and write a report of the flight.", examples, _run, notes=COSTS)
-    option(parser, "SCENARIO", "by default the paper's flight", Path, nargs="?")
+    option(parser, "SCENARIO", "the scenario's file (default: the paper's flight)", Path, nargs="?")
     option(
         parser,
         "--perception",
@@ -98,7 +98,7 @@ def add(commands: Commands) -> None:
         "size of the flock (default: the scenario's; --live by sight: three on two processors, five on four)",
         _flock_size,
     )
-    option(parser, "--duration S", "seconds to fly; the world is made to fit", positive_number)
+    option(parser, "--duration S", "seconds to fly; the world is as large as the flight needs", positive_number)
     option(parser, "--seed N", "seed of the world and of all noise", whole_number("a whole number, 0 or more"))
     option(
         parser,

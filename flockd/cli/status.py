@@ -35,7 +35,7 @@ def add(commands: Commands) -> None:
     )
     parser = commands("status", "Show the state of each drone of a fleet, the worst first.", examples, _run)
     add_endpoint_options(parser)
-    option(parser, "--seconds S", "listen this long and print once, also on a terminal", duration)
+    option(parser, "--seconds S", "listen for S seconds and print once, instead of a live table", duration)
     flag(parser, "--json", "print JSON, once")
 
 
