@@ -212,12 +212,12 @@ class RigCalibration:
     """The filter of one rig. Its state has the mounting, time offset and focal length of each camera, and parameters
     common to all."""
 
-    def __init__(self, rig: Rig, first: RigCalibration | None = None) -> None:
-        """``first``: a filter after the same updates, which is used up. Measurements that contradict its result are
-        left out: a new filter would accept wrong ones, for example in front of the sky."""
-        self._first = first
-        if first is not None:
-            first._wait(math.inf)  # the velocity's error was another one then
+    def __init__(self, rig: Rig, judge: RigCalibration | None = None) -> None:
+        """``judge``: a filter of other looks of the same flight, which is used up. Measurements that contradict its
+        result are left out: a new filter would accept wrong ones, for example in front of the sky."""
+        self._judge = judge
+        if judge is not None:
+            judge._wait(math.inf)  # the velocity's error was another one then
         self._cameras = {
             name: _Camera(mounted, mounted.T_body_camera.rotation) for name, mounted in rig.cameras.items()
         }
@@ -254,7 +254,7 @@ class RigCalibration:
         looks = before, after, pairs
         sights = ((name, self._sight(name, *looks)) for name in self._cameras)
         fitting = [(name, sight) for name, sight in sights if sight is not None and self._fits(sight, moves=moves)]
-        used = [sight for name, sight in fitting if self._first is None or self._first.expects(name, *looks)]
+        used = [sight for name, sight in fitting if self._judge is None or self._judge.expects(name, *looks)]
         if not used:
             return
         size, off = len(self._covariance), np.zeros(6)

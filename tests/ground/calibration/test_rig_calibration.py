@@ -12,7 +12,7 @@ import pytest
 from flockd.core.messages import FloatArray, VehicleState
 from flockd.flight.geometry import RigidTransform, rotation_from_euler, rotation_from_vector, vector_from_rotation
 from flockd.ground.calibration.camera_motion import camera_motion
-from flockd.ground.calibration.from_flight import judged_again
+from flockd.ground.calibration.from_flight import calibrated
 from flockd.ground.calibration.rig_calibration import CameraDeviation, RigCalibration, Seen, rig_faults, rolling
 from tests.flight.geometry.synthetic_world import EXACT, World, boxes_around, seen_twice
 from tests.flight.geometry.wrong_rigs import AS_CONFIGURED, CONFIGURED, STRAIGHT, Autopilot, Way, Wrong, lively, looks
@@ -55,20 +55,20 @@ def test_two_degrees_thirty_milliseconds_and_two_percent_are_known_after_a_minut
 
 
 def test_a_camera_that_is_wrong_for_a_second_is_left_out_by_what_the_flight_shows_later() -> None:
-    """At first, while nothing is known, it would be believed."""
+    """At first, while nothing is known, it would be believed; also by what these two looks themselves made known."""
     random = np.random.default_rng(2)
     flight = [
         (seen(before), seen(after), pairs) for before, after, pairs in looks(lively(random), AS_CONFIGURED, random, 20)
     ]
     for number, axis in enumerate(np.eye(2)):
         before, after, pairs = flight[number]
-        shifted = pairs.pixels_current + 15.0 * axis * (pairs.camera_names == "back")[:, None]
+        shifted = pairs.pixels_current + 30.0 * axis * (pairs.camera_names == "back")[:, None]
         flight[number] = before, after, replace(pairs, pixels_current=shifted)
     first = RigCalibration(CONFIGURED)
     for look in flight:
         first.update(*look)
-    assert all(rig_faults(found) for found in first.deviations())
-    for found in judged_again(CONFIGURED, first, flight).deviations():
+    assert any(rig_faults(found) for found in first.deviations())
+    for found in calibrated(CONFIGURED, flight).deviations():
         assert not rig_faults(found)
         assert off_deg(found, np.zeros(3)) < 0.5
 
