@@ -118,7 +118,7 @@ def corrected_rig(
         raise CalibrationError(f"{source}: does not show the rig: it is shorter than {LEAST_S:g} s; fly again")
     config = recording.config.rig
     offset_s, note = _offset_s(list(found.values()))
-    cameras, results, notes = [], {}, [] if note is None else [note]
+    cameras, results, notes, vague = [], {}, [] if note is None else [note], dict[str, float]()
     notes += rolling(next(iter(found.values())))
     for camera in config.cameras:
         one = found[camera.name]
@@ -149,10 +149,10 @@ def corrected_rig(
         if one.elsewhere:
             notes.append(*rig_faults(one))
         elif sigma_rad > MAX_TURN_RAD:
-            notes.append(
-                f"the mounting of camera {camera.name!r} is known to {math.degrees(sigma_rad):.1f} degrees only, "
-                "and kept: this flight turned too little about some axis"
-            )
+            vague[camera.name] = math.degrees(sigma_rad)
+    if vague:
+        told = f"the mounting of {', '.join(vague)} is known to {max(vague.values()):.1f} degrees only, and kept"
+        notes.append(f"{told}: this flight turned too little about some axis")
     if offset_s is None and not any(one["taken"] for one in results.values()):
         told = "; ".join([*notes, "what is known agrees with the configuration"])
         raise CalibrationError(f"{source}: the rig needs no correction: {told}")

@@ -83,7 +83,7 @@ def test_what_is_not_known_is_kept_and_named(tmp_path: Path) -> None:
     result = corrected_rig(recording, (seen("front", sigmas=vague), seen("left")), "flight", out)
     assert result["cameras"]["front"]["taken"] == []
     assert result["cameras"]["left"]["taken"] == ["mounting", "focal length"]
-    assert len(result["notes"]) == 1 and "camera 'front' is known to 1.2 degrees" in result["notes"][0]
+    assert len(result["notes"]) == 1 and "mounting of front is known to 1.2 degrees" in result["notes"][0]
     assert load_drone(out).rig.cameras[0] == recording.config.rig.cameras[0]
     assert result["time_offset_s"] == pytest.approx(-0.03)  # by the camera that knows it
 
