@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 from hypothesis import settings
 
+from flockd.cli import main
 from tests.calm import run_coroutine_test
 from tests.faults.stories import REACTION, Reacted, limits
 from tests.permitted_skips import permitted
@@ -61,6 +62,28 @@ def reacted(request: pytest.FixtureRequest, record_property: Callable[[str, obje
         assert 0.0 <= seconds <= limit_s, f"the reaction to {fault} took {seconds:.2f} s"
 
     return note
+
+
+Told = Callable[..., str]
+"""A command's exit code and its arguments: what stands on stdout, or the one sentence on stderr."""
+
+
+@pytest.fixture
+def told(capsys: pytest.CaptureFixture[str]) -> Told:
+    """`flockd` as a person runs it, in this process."""
+
+    def run(code: int, *arguments: object) -> str:
+        capsys.readouterr()
+        try:
+            ended = main([str(argument) for argument in arguments])
+        except SystemExit as exit_:
+            ended = int(exit_.code or 0)
+        captured = capsys.readouterr()
+        assert ended == code, captured.err
+        assert code == 0 or (captured.out, captured.err.count("\n")) == ("", 1), captured
+        return captured.err if code else captured.out
+
+    return run
 
 
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:

@@ -21,7 +21,7 @@ from flockd.core.messages import Frame, FrameSet, UInt8Array
 from flockd.ground.calibration.board import BoardFinder, BoardSpec
 from flockd.onboard.sources import CameraStatus
 from flockd.onboard.sources.device_source import Devices
-from tests.cli.conftest import Told
+from tests.conftest import Told
 from tests.ground.calibration import darkroom
 from tests.ground.calibration.darkroom import PINHOLE, facing, photograph
 from tests.onboard.sources.fake_kernel import FakeCamera, FakeKernel

@@ -19,7 +19,7 @@ from flockd.cli.fleet import _found, announce
 from flockd.fleet.watcher import FleetWatcher
 from flockd.onboard.telemetry.publisher import ZenohTelemetry
 from flockd.sim.sitl.processes import free_endpoint
-from tests.cli.conftest import Told
+from tests.conftest import Told
 
 ROOT = Path(__file__).parents[2]
 DRONE = """

@@ -10,7 +10,7 @@ import yaml
 
 from flockd.cli import main
 from flockd.core.gone import COMMANDS, KEYS
-from tests.cli.conftest import Told
+from tests.conftest import Told
 
 _CONFIG = Path(__file__).parents[2] / "config"
 

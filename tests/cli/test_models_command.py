@@ -13,7 +13,7 @@ from flockd.core.data import data_path
 from flockd.core.errors import ModelError
 from flockd.flight.inference import OnnxModel, load_manifest
 from flockd.flight.inference.providers import available
-from tests.cli.conftest import Told
+from tests.conftest import Told
 from tests.flight.inference.foreign import one_channel_depth
 
 FLOAT = ("detector", "distance", "flow", "neighbours", "verification")

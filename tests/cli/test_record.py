@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.cli.conftest import Told
+from tests.conftest import Told
 from tests.onboard.recording.made_up import MODELS, record
 
 

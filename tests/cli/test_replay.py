@@ -24,7 +24,7 @@ from flockd.review.flight_log.log import FlightLog
 from flockd.sim.flock.start import with_drones
 from flockd.sim.flock.swarm import fly
 from flockd.sim.scenario import ScenarioConfig, load_scenario
-from tests.cli.conftest import Told
+from tests.conftest import Told
 from tests.make import small_eyes
 from tests.onboard.recording.made_up import MODELS, MadeUpPilot, drone_config, record
 

@@ -24,7 +24,7 @@ from flockd.core.data import data_path
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.sitl.processes import free_endpoint, free_port
 from tests.calm import until
-from tests.cli.conftest import Told
+from tests.conftest import Told
 from tests.faults.stories import Reacted
 from tests.onboard.autopilot.conftest import HEARTBEAT_S
 from tests.onboard.daemon.aboard import Cameras, config_for

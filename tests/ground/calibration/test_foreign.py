@@ -315,7 +315,6 @@ def test_a_lens_without_an_equal_is_refused_with_how_far_the_nearest_is_off(
         ),
         (_filled(KALIBR, [0.1, 0, 0, math.nan], MODEL="radtan", CAMERA="pinhole").replace("nan", ".nan"), "finite"),
         ("1 OPENCV 640 480 1 2 3\n", "lacks or garbles the parameters of OPENCV, fx fy cx cy k1 k2 p1 p2"),
-        ("camera_matrix: 3\n", "give Kalibr's camchain"),
         ("camera_matrix: {data: [1, 2]}\n", "lacks or garbles the camera_matrix, 2 numbers; give Kalibr's camchain"),
         (f"camera_matrix: {{data: {[0] * 9}}}\n", "the camera_matrix, 9 numbers that are 0; give Kalibr's camchain"),
         ("[\n", "cannot be read ("),
