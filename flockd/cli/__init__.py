@@ -57,9 +57,9 @@ exit codes:
 
 
 def installing(extra: str) -> str:
-    """What to do for an extra: a command that leaves the rest as it is, so that a checkout stays one.
+    """How to install an extra: a pip command, which keeps a checkout editable.
 
-    A Debian package has no pip, and its files are apt's.
+    The Debian package has no pip, and its files are apt's.
     """
     if importlib.util.find_spec("pip") is None:
         return f"install flockd with the extra {extra} in an environment of its own, as docs/install.md does by hand"
@@ -70,10 +70,10 @@ def installing(extra: str) -> str:
 
 
 def program() -> NoReturn:
-    """The installed `flockd`: `main`, then the end of the process without the interpreter's own.
+    """Runs the installed `flockd`: calls `main`, then ends the process without Python's finalisation.
 
-    A library's thread that asks for Python while the interpreter takes itself down aborts the process, by SIGABRT, and
-    its exit code is lost: a service manager would start again what a wrong configuration has ended.
+    In the finalisation a library's thread that still needs Python aborts the process by SIGABRT. The exit code would be
+    lost, and a service manager would restart a drone that a wrong configuration had ended.
     """
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:  # closed by whoever started flockd; a file that it writes would take its number

@@ -205,9 +205,9 @@ def _new(args: argparse.Namespace) -> int:
 
 
 def write_checked(file: Path, text: str, settings: Sequence[tuple[str, str]] = ()) -> None:
-    """Writes the file, with these values by key, if it checks, else leaves all as it was. Raises UsageError.
+    """Writes a configuration with these values by key. Raises UsageError, and changes nothing, where it is not valid.
 
-    The draft stands beside it: paths count from there.
+    The draft is in the same folder, from which relative paths count.
     """
     from flockd.sim.scenario import load
 

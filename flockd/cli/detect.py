@@ -177,6 +177,7 @@ def _detected(
     """In order; what cannot be read is skipped, and why appended to ``left_out``."""
     import numpy as np
 
+    from flockd.ground.datasets.image_files import DatasetError
     from flockd.ground.pictures.copies import annotated
     from flockd.ground.pictures.video_tracks import VideoTracker
 
@@ -186,17 +187,20 @@ def _detected(
         for picture in pictures:
             tracker = VideoTracker() if picture.is_video else None
             with nullcontext() if copies is None else copies.of(picture, args.every) as write:
-                for one in _readable(picture, args.every, left_out):
-                    _check_size(args, one, camera)
-                    begin = time.perf_counter()
-                    result = _look(args, detector, camera, tracker, one)
-                    seconds = time.perf_counter() - begin
-                    if write is not None:
-                        write(annotated(one.image, result))
-                    has_colour = bool(np.ptp(one.image[::8, ::8], axis=2).mean() >= _COLOUR)
-                    yield _Detected(picture, one, result.detections, result.proposals, seconds, has_colour)
-                    done += 1
-                    tell(done, max(done, count))
+                try:
+                    for one in picture.images(args.every):
+                        _check_size(args, one, camera)
+                        begin = time.perf_counter()
+                        result = _look(args, detector, camera, tracker, one)
+                        seconds = time.perf_counter() - begin
+                        if write is not None:
+                            write(annotated(one.image, result))
+                        has_colour = bool(np.ptp(one.image[::8, ::8], axis=2).mean() >= _COLOUR)
+                        yield _Detected(picture, one, result.detections, result.proposals, seconds, has_colour)
+                        done += 1
+                        tell(done, max(done, count))
+                except DatasetError as error:
+                    left_out.append(str(error))
 
 
 def _look(
@@ -221,15 +225,6 @@ def _check_size(args: argparse.Namespace, picture: Picture, camera: Camera | Non
             f"{picture.name}: is {width} x {height} pixels, and the camera of {args.config} {camera.size[0]} x "
             f"{camera.size[1]}; give pictures of that camera, or --fov too"
         )
-
-
-def _readable(picture: PictureFile, every: int, left_out: list[str]) -> Iterator[Picture]:
-    from flockd.ground.datasets.image_files import DatasetError
-
-    try:
-        yield from picture.images(every)
-    except DatasetError as error:
-        left_out.append(str(error))
 
 
 def _result(detected: Sequence[_Detected]) -> dict[str, Any]:

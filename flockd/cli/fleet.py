@@ -279,7 +279,7 @@ def _show_page(args: argparse.Namespace) -> int:
 
 
 async def serve_page(page: PageServer, address: str, port: int, served: Callable[[int], None]) -> None:
-    """Until it is cancelled, as Ctrl-C does. ``served`` gets the port once the page can be opened.
+    """Serves the page until it is cancelled. ``served`` is called with the port once the page can be opened.
 
     Raises UnavailableError for an address or a port that cannot be used.
     """
@@ -304,7 +304,7 @@ async def serve_page(page: PageServer, address: str, port: int, served: Callable
 
 
 def announce(args: argparse.Namespace, key: str, port: int) -> None:
-    """Says where it is served, once it is, and where other computers reach it, what they may do."""
+    """Prints the page's address, and a warning where other computers can reach it."""
     where = ipaddress.ip_address(args.server_address)
     # For all addresses of this computer, the one at which it reaches itself.
     host = HERE if where.is_unspecified else f"[{where}]" if where.version == 6 else str(where)

@@ -42,7 +42,7 @@ def _fleet(text: str) -> str:
 
 
 def add_operator_option(parser: Parser) -> None:
-    """Adds who gives orders."""
+    """Adds --operator, the name in which orders are given."""
     option(
         parser,
         "--operator NAME",
@@ -93,7 +93,7 @@ def _setting(text: str) -> tuple[str, str]:
 
 
 def require(*paths: Path) -> None:
-    """Raises FlockdError for what is not there, before anything is imported that takes seconds."""
+    """Raises FlockdError for a path that does not exist, before anything slow is imported."""
     for path in paths:
         if not path.exists():
             raise FlockdError(f"{path}: does not exist; check the path")
@@ -131,12 +131,12 @@ def opened(path: Path) -> Recording:
 
 
 def add_force(parser: Parser) -> None:
-    """Adds the option."""
+    """Adds --force, which permits values outside the proven envelope."""
     flag(parser, "--force", "accept speeds above those that were shown to be safe")
 
 
 def load_to_fly(file: Path, *, force: bool) -> DroneConfig:
-    """What the drone flies with. Raises ConfigError, also for what is outside the envelope, unless that is forced."""
+    """The configuration of a real drone. Raises ConfigError, without ``force`` also outside the proven envelope."""
     from flockd.core.config import load_real_drone
 
     config, outside = load_real_drone(file)
@@ -145,7 +145,7 @@ def load_to_fly(file: Path, *, force: bool) -> DroneConfig:
 
 
 def permit(outside: Sequence[ConfigProblem], *, force: bool) -> None:
-    """Warns of what is outside the envelope where that is forced, else raises it as ConfigError."""
+    """Reports values outside the proven envelope: with ``force`` as warnings, else by a ConfigError."""
     if outside and not force:
         raise ConfigError(outside)
     for problem in outside:
@@ -153,7 +153,7 @@ def permit(outside: Sequence[ConfigProblem], *, force: bool) -> None:
 
 
 def loaded(file: Path | None) -> DroneConfig | None:
-    """The drone of --config, which may also name a scenario. Raises ConfigError."""
+    """The drone of a file, which may also be a scenario; None without a file. Raises ConfigError."""
     from flockd.sim.scenario import ScenarioConfig, load
 
     if file is None:

@@ -98,7 +98,7 @@ def say_result(args: argparse.Namespace, facts: object, *lines: str) -> int:
 
 
 def say_facts(args: argparse.Namespace, facts: object, *lines: str) -> int:
-    """The same, of a command whose facts speak for themselves: people get them as YAML, to four digits."""
+    """Writes a command's facts: as --json says, or else as YAML with four digits, and then the lines."""
     if not args.json:
         import yaml
 

@@ -169,7 +169,7 @@ def option(
 
 
 def _path(text: str) -> Path:
-    """As of a shell's variable that is not set: the folder one is in would be taken for it."""
+    """Refuses an empty text, as of a shell variable that is not set: it would mean the current folder."""
     if not text:
         raise argparse.ArgumentTypeError("'' is no path; name one")
     return Path(text)
@@ -196,7 +196,7 @@ def number(words: str, low: float = -math.inf, high: float = math.inf, *, above:
 
 
 def whole_number(words: str, low: int = 0, high: int = 10**18) -> Callable[[str], int]:
-    """The same, of whole numbers."""
+    """The kind of an option whose value is a whole number within these limits."""
 
     def parsed(text: str) -> int:
         if re.fullmatch("[0-9]{1,18}", text) is None or not low <= int(text) <= high:

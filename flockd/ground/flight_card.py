@@ -18,8 +18,6 @@ REACTIONS = {
     Reaction.LAND: "asks PX4 for Land",
     Reaction.SILENCE: "sends nothing; PX4's own failsafe acts",
 }
-
-
 TEXT = """\
 # Flight-day card: {name}
 

@@ -14,7 +14,10 @@ from flockd.flight.inference import OnnxModel
 
 
 def write_manifest(document: dict[str, Any], file: Path, golden: Mapping[str, NDArray[Any]]) -> Path:
-    """``document`` beside ``file``, with the file's hash and its ``golden`` outputs; opened once, as flockd does."""
+    """Writes the manifest of a model ``file`` beside it, with its hash and its ``golden`` outputs. Returns its path.
+
+    Opens the model once, as flockd does. Raises ModelError.
+    """
     document["sha256"] = hashlib.sha256(file.read_bytes()).hexdigest()
     for name, value in golden.items():
         document["outputs"][name] |= {"golden_mean": float(value.mean()), "golden_deviation": float(value.std())}
@@ -24,7 +27,7 @@ def write_manifest(document: dict[str, Any], file: Path, golden: Mapping[str, ND
 
 
 def write_unchecked(document: dict[str, Any], file: Path) -> Path:
-    """``document`` beside ``file``, as it is."""
+    """Writes ``document`` beside ``file`` without a check. Returns its path."""
     path = file.with_suffix(".yaml")
     path.write_text(yaml.dump(document, Dumper=WithoutAliases, sort_keys=False, width=110), encoding="utf-8")
     return path
@@ -34,5 +37,5 @@ class WithoutAliases(yaml.SafeDumper):
     """Writes a list that two keys share twice, because manifests may not have anchors."""
 
     def ignore_aliases(self, data: Any) -> bool:
-        """Whatever it is."""
+        """True for every value."""
         return True

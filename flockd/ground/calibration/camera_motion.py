@@ -104,7 +104,7 @@ def camera_motion(
 
 @dataclass(frozen=True, eq=False)
 class Sights:
-    """Directions of n points before and after, in a camera's axes; coordinate by coordinate, as numpy is faster so."""
+    """Directions of n points before and after, in a camera's axes. Each coordinate is a row: numpy is faster so."""
 
     before: FloatArray
     """(3, n) points, metres."""

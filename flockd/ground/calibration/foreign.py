@@ -172,8 +172,6 @@ _NAMES: Mapping[str, tuple[str, ...]] = {
     "xi": ("xi",),
 }
 """What OpenCV's programs and tutorials call them."""
-
-
 _ECHOED = {"k": "camera_matrix", "d": "distortion_coefficients", "width": "image_width", "height": "image_height"}
 """As `ros2 topic echo` and `rostopic echo` print a CameraInfo."""
 

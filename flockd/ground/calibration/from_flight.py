@@ -38,7 +38,7 @@ MAX_TURN_RAD, MAX_OFFSET_S, MAX_FOCAL = math.radians(0.5), 0.01, 0.01
 """Largest standard deviations of a mounting about its worst axis, of a time, and of a focal length that are taken
 over."""
 LEAST_S = 5.0
-"""Last seconds of a flight that are used."""
+"""Shortest flight that is judged."""
 _JUDGED = 60
 """Number of first looks of which the earlier half is judged by the later one."""
 Look = tuple[Seen, Seen, PointPairs]
@@ -92,9 +92,8 @@ def found_rig(
 def calibrated(rig: Rig, looks: Sequence[Look]) -> RigCalibration:
     """The filter after these looks, without the measurements that contradict what the later half of them shows.
 
-    While nothing is known, a camera with wrong matches is believed: as drones start, one of the first looks turned the
-    rigs of two of eight simulated flights of 10 s by seven standard deviations, and a focal length by six. Looks that
-    had been used themselves did not tell them.
+    While nothing is known, wrong matches are believed: as drones start, one of the first looks turned the rigs of two
+    of eight simulated flights of 10 s by seven standard deviations, and a filter that had used it did not contradict.
     """
     later = RigCalibration(rig)
     for look in looks[len(looks) // 2 :]:

@@ -147,11 +147,9 @@ def tilt_deg(pose: RigidTransform) -> float:
     return math.degrees(math.acos(min(abs(float(pose.rotation[2, 2])), 1.0)))
 
 
-def rough_tilts_deg(views: Sequence[View], size: tuple[int, int], model: LensModel) -> list[float]:
+def _rough_tilts_deg(views: Sequence[View], size: tuple[int, int]) -> list[float]:
     """Tilts of the board before its camera is calibrated: good enough for advice."""
-    if len(views) < 2:
-        return [0.0] * len(views)
-    return [tilt_deg(pose) for pose in _begin(views, size, model)[1]]
+    return [0.0] * len(views) if len(views) < 2 else [tilt_deg(pose) for pose in _begin(views, size, "wide_angle")[1]]
 
 
 def _check_known(lens: Lens) -> None:
@@ -278,10 +276,10 @@ def collect_views(
 
 def is_enough(collector: Collector) -> bool:
     """Whether a live camera's views are enough, cover the image and are tilted enough."""
-    if len(collector.views) < ENOUGH_VIEWS or collector.coverage is None or collector.size is None:
+    seen = collector.coverage
+    if seen is None or len(collector.views) < ENOUGH_VIEWS:
         return False
-    tilts = rough_tilts_deg(collector.views, collector.size, "wide_angle")
-    return collector.coverage.share >= ENOUGH_SHARE and not collector.coverage.advice(tilts)
+    return seen.share >= ENOUGH_SHARE and not seen.advice(_rough_tilts_deg(collector.views, seen.size))
 
 
 def fit_lenses(collector: Collector, model: LensModel | None, source: str) -> list[Lens]:
@@ -290,7 +288,7 @@ def fit_lenses(collector: Collector, model: LensModel | None, source: str) -> li
     Raises CalibrationError, which names ``source``, without views or if no model fits.
     """
     counts = collector.counts()
-    if collector.size is None:
+    if collector.coverage is None:
         raise CalibrationError(f"{source}: holds no image of the camera; name another source")
     if not collector.views:
         why = ", ".join(f"{count} {reason}" for reason, count in counts.items())
@@ -301,7 +299,7 @@ def fit_lenses(collector: Collector, model: LensModel | None, source: str) -> li
     found, faults = [], []
     for one in (model,) if model else LENS_MODELS:
         try:
-            found.append(calibrate(collector.views, collector.size, one))
+            found.append(calibrate(collector.views, collector.coverage.size, one))
         except CalibrationError as error:
             faults.append(error)
     if not found:
@@ -359,9 +357,8 @@ def lens_result(lens: Lens, lenses: Sequence[Lens], collector: Collector) -> dic
 def _next_step(collector: Collector) -> str:
     """Instruction for a person who holds a board in front of a live camera."""
     assert collector.coverage is not None
-    assert collector.size is not None
     head = f"{len(collector.views)} views, {100 * collector.coverage.share:.0f} % covered"
     if not collector.views:
         return f"{head}: hold the board before the camera, and hold it still"
-    advice = collector.coverage.advice(rough_tilts_deg(collector.views, collector.size, "wide_angle"))
+    advice = collector.coverage.advice(_rough_tilts_deg(collector.views, collector.coverage.size))
     return f"{head}: {advice[0] if advice else 'go on, or end it with Ctrl-C'}"

@@ -53,23 +53,24 @@ class ForeignLens:
 
     @property
     def is_pinhole(self) -> bool:
-        """Whether the three are those of a pinhole."""
+        """Whether xi, alpha and beta are a pinhole's."""
         return (self.xi, self.alpha, self.beta) == (0.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True)
 class NearestLens:
-    """What fits best, and how far off it is."""
+    """The lens of flockd that fits best."""
 
     model: LensModel
     numbers: FloatArray
     """fx, fy, cx, cy, then the distortion."""
     off_deg: float
+    """Largest angle between the directions of both lenses over the image."""
     rms_deg: float
 
 
 def nearest_lens(lens: ForeignLens, where: str) -> NearestLens:
-    """Fitted over the image by least squares. Raises CalibrationError for a lens that shows no directions."""
+    """Fits each lens model of flockd over the image by least squares. Raises CalibrationError if none can be fitted."""
     sides = [np.linspace(0.5, side - 0.5, _GRID) for side in lens.size]
     pixels = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
     try:

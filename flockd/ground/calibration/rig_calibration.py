@@ -94,14 +94,14 @@ class CameraDeviation:
     """Ratio of its focal lengths to the configured ones."""
     covariance: FloatArray
     """(5, 5) of turn, time offset, and the focal scale's logarithm."""
+    readout_s: FloatArray
+    """(2,) seconds in which rows are read one after the other, over the image's width (from its right: negative) and
+    over its height; of all cameras together. Near 0: a global shutter."""
+    readout_sigma_s: FloatArray
+    """(2,) standard deviations."""
     elsewhere: bool = False
     """Whether its motion contradicts the drone's by more than a small error of the mounting: it is on its side or
     upside down, exchanged with another camera, or covered. The other numbers are then invalid."""
-    readout_s: FloatArray | None = None
-    """(2,) seconds in which rows are read one after the other, over the image's width (from its right: negative) and
-    over its height; of all cameras together. Near 0: a global shutter."""
-    readout_sigma_s: FloatArray | None = None
-    """(2,) standard deviations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,8 +162,6 @@ def described(deviation: CameraDeviation) -> str:
 
 def rolling(deviation: CameraDeviation) -> tuple[str, ...]:
     """One sentence for each side of the images over which rows are read one after the other, as far as is known."""
-    if deviation.readout_s is None or deviation.readout_sigma_s is None:
-        return ()
     sides = zip(("width", "height"), deviation.readout_s, deviation.readout_sigma_s, strict=True)
     return tuple(
         f"rows are read over the images' {side} in {1e3 * time_s:+.0f} +- {1e3 * sigma_s:.0f} ms: a rolling shutter"

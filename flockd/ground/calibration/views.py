@@ -132,11 +132,10 @@ class Collector:
         self._finder = finder
         self._first = ""
         self._before: BoardDetection | None = None
-        self.size: tuple[int, int] | None = None
-        """Width, height; None before the first image."""
         self.views: list[View] = []
         self.refused: list[Refused] = []
         self.coverage: Coverage | None = None
+        """None before the first image."""
 
     def offer(self, name: str, image: UInt8Array, *, moving: bool = False) -> Refusal | None:
         """Takes an RGB image (h, w, 3). Returns why it is refused; None: it is a new view.
@@ -173,12 +172,12 @@ class Collector:
         return dict(Counter(refused.why for refused in self.refused))
 
     def _check_size(self, name: str, size: tuple[int, int]) -> None:
-        if self.size is None:
-            self.size, self._first, self.coverage = size, name, Coverage(size)
-        elif size != self.size:
+        if self.coverage is None:
+            self._first, self.coverage = name, Coverage(size)
+        elif size != (before := self.coverage.size):
             raise CalibrationError(
-                f"{name}: is {size[0]} x {size[1]} pixels and {self._first} is {self.size[0]} x {self.size[1]}; "
-                "calibrate with images of one size only"
+                f"{name}: is {size[0]} x {size[1]} pixels and {self._first} is {before[0]} x {before[1]}; calibrate "
+                "with images of one size only"
             )
 
     def _refuse(self, refused: Refused) -> Refusal:

@@ -165,7 +165,7 @@ def _is_silent(status: AutopilotStatus, config: DroneConfig) -> bool:
 
 
 def judge_heartbeat(system_id: int, status: AutopilotStatus, config: DroneConfig) -> Finding:
-    """Whether it is heard, and on the ground."""
+    """Whether the autopilot is heard, and disarmed."""
     address = "" if config.autopilot is None else f" at {config.autopilot.address}"
     measured = f"system {system_id}{address}, heard {status.heartbeat_age_s:.1f} s ago"
     if _is_silent(status, config):
@@ -176,7 +176,7 @@ def judge_heartbeat(system_id: int, status: AutopilotStatus, config: DroneConfig
 
 
 def judge_refusals(refusals: Sequence[Refusal]) -> list[Finding]:
-    """Why it could not be armed or fly offboard now."""
+    """Whether it could be armed and fly offboard now; else each reason."""
     if not refusals:
         return [passed("arming", "it can be armed and fly offboard")]
     refused = [(f"refuses {refusal.refused}: " if refusal.refused else "", refusal) for refusal in refusals]
@@ -206,7 +206,7 @@ def judge_firmware(firmware: Firmware) -> Finding:
 
 
 def judge_parameter(name: str, value: float, config: DroneConfig) -> Finding:
-    """One of `PARAMETERS`."""
+    """Whether the value of one of `PARAMETERS` is safe."""
     gate = config.safety.gate
     match name:
         case "COM_OF_LOSS_T":

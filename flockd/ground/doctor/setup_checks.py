@@ -18,7 +18,7 @@ LISTEN_S = 3.0
 
 
 def check_limits(config: DroneConfig) -> Iterator[Finding]:
-    """``config`` as it is flown."""
+    """The limits of the flight, and what is outside the proven envelope; ``config``: as `flockd run` flies it."""
     speed, layer = f"{config.flocking.max_speed_m_s:g} m/s at most", config.safety.first_flight_layer
     if layer is None:
         yield passed("first flight", f"off: {speed}")
@@ -44,7 +44,7 @@ def check_instance(taken: UnavailableError | None) -> Iterator[Finding]:
 
 
 def check_fleet(config: DroneConfig, listen_s: float = LISTEN_S) -> Iterator[Finding]:
-    """Raises UnavailableError for endpoints or settings that cannot be used."""
+    """Whether this drone's name is free in its fleet. Raises UnavailableError for endpoints that cannot be used."""
     wanted = config.telemetry
     settings = None if wanted.zenoh_config is None else Path(wanted.zenoh_config)
     with FleetWatcher(wanted.fleet, listen=wanted.listen, connect=wanted.connect, settings=settings) as watcher:

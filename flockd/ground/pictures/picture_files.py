@@ -30,7 +30,7 @@ class Picture(NamedTuple):
     image: UInt8Array
     """(h, w, 3) RGB"""
     time_s: float = 0.0
-    """Time since the beginning of the video; None: an image."""
+    """Time since the beginning of the video; 0: an image."""
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,7 @@ def seen(
     focal: float = 1.02,
     sigmas: tuple[float, ...] = WELL,
 ) -> CameraDeviation:
-    return CameraDeviation(camera, turn, time_s, focal, np.diag(np.array(sigmas) ** 2))
+    return CameraDeviation(camera, turn, time_s, focal, np.diag(np.array(sigmas) ** 2), np.zeros(2), np.ones(2))
 
 
 def recorded(folder: Path, steps: int = 2, change: Callable[[PilotOutput], PilotOutput] = lambda one: one) -> Recording:

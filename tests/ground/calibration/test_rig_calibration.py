@@ -86,7 +86,9 @@ def test_what_differs_by_less_than_one_in_ten_thousand_right_rigs_do_is_not_told
     """Three numbers as one exceed 3.9 standard deviations once in 608 times, 4.9 once in 40,000 (chi-squared)."""
     sigma = np.array([math.radians(0.5)] * 3 + [0.01, 0.01])
     turn = np.array([(sigmas + 0.4) * sigma[0], 0.0, 0.0])
-    found = CameraDeviation("front", turn, sigmas * sigma[3], math.exp(sigmas * sigma[4]), np.diag(sigma**2))
+    found = CameraDeviation(
+        "front", turn, sigmas * sigma[3], math.exp(sigmas * sigma[4]), np.diag(sigma**2), np.zeros(2), sigma[:2]
+    )
     assert len(rig_faults(found)) == told
 
 
