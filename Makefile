@@ -5,6 +5,7 @@ SYSTEM ?= debian12
 ARCH ?= arm64
 VENV := .venv
 BIN := $(VENV)/bin
+BUILDER ?= $(shell command -v podman || echo docker)
 # ROS 2's wheels start each Python twice, to name their libraries to the loader: an environment of their own.
 ROS_VENV := .venv-ros
 LOCK := requirements/service.txt
@@ -84,8 +85,11 @@ deb: $(BIN)/pip ### build Debian packages for amd64 and arm64 in dist; SYSTEM=de
 	$(BIN)/python -m tools.release.deb --arch amd64 --system $(SYSTEM) --out dist
 	$(BIN)/python -m tools.release.deb --arch arm64 --system $(SYSTEM) --out dist
 
-container: $(BIN)/pip ### build the container, install this computer's package of dist in another, and run both; BASE=IMAGE for another Debian 12
-	$(BIN)/python -m tools.release.check_container --packages dist $(if $(BASE),--base $(BASE))
+container: ### build the container with podman or docker, and replay a flight in it; BASE=IMAGE for another Debian 12
+	$(BUILDER) build $(if $(BASE),--build-arg BASE=$(BASE)) --tag localhost/flockd .
+	$(BUILDER) run --rm localhost/flockd models verify
+	$(BUILDER) run --rm --volume ./tests/review/replay/normal.mcap:/tmp/flight.mcap:ro localhost/flockd \
+		replay /tmp/flight.mcap --out /tmp/replayed
 
 install-emulated: $(VENV)/test.installed ### as root: install the arm64 package in a new system under emulation, and fly it; SYSTEM=debian13, ARCH=, MIRROR=URL
 	$(BIN)/python -m tools.release.check_emulated --system $(SYSTEM) --arch $(ARCH) $(if $(MIRROR),--mirror $(MIRROR))

@@ -29,9 +29,9 @@ from typing import NamedTuple
 from flockd import __version__
 from tools.checks.references import with_float_networks
 from tools.release import deb
-from tools.release.check_container import FLIGHT
 from tools.release.wheels import ROOT
 
+FLIGHT = Path("tests/review/replay/normal.mcap")
 DEBIAN, UBUNTU_PORTS = "http://deb.debian.org/debian", "http://ports.ubuntu.com/ubuntu-ports"
 
 
