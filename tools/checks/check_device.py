@@ -28,7 +28,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +40,6 @@ PROGRAMS = {"qemu-system-x86_64": "qemu-system-x86", "mmdebstrap": "mmdebstrap",
 PACKAGES = (
     *("systemd-sysv", "udev", "dbus", "kmod", "sudo", "iproute2", "procps", "python3", "python3-venv"),
     *("linux-image-amd64", "linux-headers-amd64", "v4l2loopback-dkms", "initramfs-tools", "zstd"),
-    *("gstreamer1.0-plugins-base", "gstreamer1.0-plugins-good", "gstreamer1.0-tools", "gstreamer1.0-plugins-base-apps"),
 )
 SUITES = {"12": "bookworm", "13": "trixie"}
 """By Debian's version: its name at Debian."""
@@ -87,7 +86,6 @@ def main() -> int:
     """Builds, boots, listens, and prints."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cache", type=Path, metavar="DIR", help="keep the machine's files here, and use those there")
-    parser.add_argument("--only", nargs="+", default=[], choices=("capture", "service"))
     parser.add_argument("--debian", choices=tuple(SUITES), default="12", help="what boots; default: %(default)s")
     arguments = parser.parse_args()
     try:
@@ -96,24 +94,24 @@ def main() -> int:
         if arguments.cache is not None:
             kept = (arguments.cache / f"debian{arguments.debian}").resolve()
             kept.mkdir(parents=True, exist_ok=True)
-            return check(kept, arguments.debian, arguments.only)
+            return check(kept, arguments.debian)
         with tempfile.TemporaryDirectory(prefix="flockd-device-", dir="/var/tmp") as folder:
-            return check(Path(folder), arguments.debian, arguments.only)
+            return check(Path(folder), arguments.debian)
     except UnavailableError as error:
         print(f"check_device: {error}", file=sys.stderr)
         return UNAVAILABLE
 
 
-def check(folder: Path, debian: str, groups: Sequence[str]) -> int:
-    """All groups, or these; the exit code."""
+def check(folder: Path, debian: str) -> int:
+    """The exit code."""
     begun_s, passed, failed = time.monotonic(), 0, 0
     install, start = documented_lines()
     image = _build(folder, debian, install)
     shared = _fresh(folder / "check")
     shutil.copytree(ROOT / CHECKS, shared / CHECKS)
     (shared / "start.sh").write_text(start, encoding="utf-8")
-    command = ["-m", "tools.checks.device_check.guest", "/mnt/findings/lines", "start.sh", *groups]
-    (shared / "check.sh").write_text(f"exec /opt/flockd/bin/python {' '.join(command)}\n", encoding="utf-8")
+    command = "exec /opt/flockd/bin/python -m tools.checks.device_check.service /mnt/findings/lines start.sh\n"
+    (shared / "check.sh").write_text(command, encoding="utf-8")
     for line in _run(folder, image, shared):
         if "check" in line:
             passed, failed = passed + line["passed"], failed + (not line["passed"])

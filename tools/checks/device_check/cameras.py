@@ -1,12 +1,11 @@
 """The virtual cameras: one of `vivid`, and one of `v4l2loopback` whose sensor is this module as a process.
 
-python -m tools.checks.device_check.cameras mjpeg 640 480 25
+python -m tools.checks.device_check.cameras 640 480 25
 """
 
 from __future__ import annotations
 
 import fcntl
-import functools
 import itertools
 import os
 import signal
@@ -18,7 +17,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from flockd.core.choices import PixelFormat
 from flockd.onboard.sources.v4l2_device import control_name
 from flockd.onboard.sources.v4l2_kernel import (
     VIDIOC_QUERYCTRL,
@@ -76,16 +74,12 @@ def control(name: str, value: int = 1) -> float:
     return now_s
 
 
-@functools.cache
-def image(pixel_format: PixelFormat, size: Size, number: int) -> bytes:
-    """What the loopback camera shows: as YUYV every byte by chance within what video allows; else a JPEG.
+def image(size: Size, number: int) -> bytes:
+    """A JPEG that the loopback camera shows: sky above grass that passes by.
 
-    The JPEG is sky above grass that passes by. Nothing resembles a drone: to range one takes an emulated processor
-    long.
+    Nothing resembles a drone: to range one takes an emulated processor long.
     """
     width, height = size
-    if pixel_format == "yuyv":
-        return np.random.default_rng(number).integers(16, 236, width * height * 2, np.uint8).tobytes()
     wide, high = width + _PASSING_PX * COUNT, height - height // 2
     blades = np.random.default_rng(0).integers(*_GRASS, (high // 2, wide // 2, 3), dtype=np.uint8)
     scene = np.full((height, width, 3), _SKY, np.uint8)
@@ -96,9 +90,9 @@ def image(pixel_format: PixelFormat, size: Size, number: int) -> bytes:
 class Feeder:
     """The process behind the loopback camera."""
 
-    def __init__(self, pixel_format: PixelFormat, size: Size, rate_hz: float) -> None:
+    def __init__(self, size: Size, rate_hz: float) -> None:
         """Begins with its first image."""
-        command = [sys.executable, "-m", __name__, pixel_format, *map(str, size), str(rate_hz)]
+        command = [sys.executable, "-m", __name__, *map(str, size), str(rate_hz)]
         self.process = subprocess.Popen(command, stdout=subprocess.PIPE)
         assert self.process.stdout is not None
         if not self.process.stdout.read(1):
@@ -120,14 +114,13 @@ class Feeder:
         self.process.wait()
 
 
-def feed(pixel_format: PixelFormat, size: Size, rate_hz: float) -> None:
+def feed(size: Size, rate_hz: float) -> None:
     """Plays the sensor until it is killed; prints a word when the first image is out."""
-    fourcc = int.from_bytes(b"YUYV" if pixel_format == "yuyv" else b"MJPG", "little")
     wanted = Format(
-        type=_OUTPUT, width=size[0], height=size[1], pixelformat=fourcc, field=_PROGRESSIVE,
+        type=_OUTPUT, width=size[0], height=size[1], pixelformat=int.from_bytes(b"MJPG", "little"), field=_PROGRESSIVE,
         sizeimage=2 * size[0] * size[1],
     )  # fmt: skip
-    frames = [image(pixel_format, size, number) for number in range(COUNT)]
+    frames = [image(size, number) for number in range(COUNT)]
     descriptor = os.open(LOOPBACK, os.O_RDWR)
     fcntl.ioctl(descriptor, VIDIOC_S_FMT, wanted)
     due_s = time.monotonic()
@@ -140,5 +133,5 @@ def feed(pixel_format: PixelFormat, size: Size, rate_hz: float) -> None:
 
 
 if __name__ == "__main__":
-    _, kind, wide_px, high_px, hz = sys.argv
-    feed("yuyv" if kind == "yuyv" else "mjpeg", (int(wide_px), int(high_px)), float(hz))
+    _, wide_px, high_px, hz = sys.argv
+    feed((int(wide_px), int(high_px)), float(hz))

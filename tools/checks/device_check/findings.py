@@ -56,12 +56,12 @@ def soon(check: str, took_s: float, limit_s: float, row: int | None = None) -> F
     return Finding(check, took_s <= limit_s, f"{took_s:.2f} s", f"within {limit_s:g} s", row)
 
 
-def until(condition: Callable[[], bool], what: str, *, look_s: float = 0.1, within_s: float = PATIENCE_S) -> float:
+def until(condition: Callable[[], bool], what: str, *, look_s: float = 0.1) -> float:
     """When it became so, on the monotonic clock. Raises TimeoutError, which names what was waited for."""
     begun_s = time.monotonic()
     while not condition():
-        if time.monotonic() - begun_s > within_s:
-            raise TimeoutError(f"waited {within_s:g} s for {what}")
+        if time.monotonic() - begun_s > PATIENCE_S:
+            raise TimeoutError(f"waited {PATIENCE_S:g} s for {what}")
         time.sleep(look_s)
     return time.monotonic()
 

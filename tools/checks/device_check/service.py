@@ -1,7 +1,10 @@
 """Checks of flockd as a service: the real `flockd run` with the shipped networks, under the real unit.
 
-Its autopilot is a fake. Its cameras are virtual: the front one has a process of ours behind it, the back one is of
-`vivid` and can be unplugged.
+python -m tools.checks.device_check.service FINDINGS START
+
+`tools/checks/check_device.py` starts it in the virtual machine, and reads what it writes to FINDINGS. START is a file
+with the documentation's lines that start the unit. The autopilot is a fake. The cameras are virtual: the front one has
+a process of ours behind it, the back one is of `vivid` and can be unplugged.
 """
 
 from __future__ import annotations
@@ -10,6 +13,7 @@ import json
 import os
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
@@ -24,8 +28,8 @@ from flockd.onboard.recording.reader import Recording
 from flockd.onboard.sources.image_formats import MjpegFormat
 from flockd.onboard.sources.v4l2_device import V4l2Device
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
-from tools.checks.device_check.cameras import COUNT, WEBCAM, Feeder, control, image
-from tools.checks.device_check.findings import PATIENCE_S, UNIT, Finding, run, shown, soon, until
+from tools.checks.device_check.cameras import COUNT, WEBCAM, Feeder, control, image, load
+from tools.checks.device_check.findings import PATIENCE_S, UNIT, Finding, run, run_checks, shown, soon, until
 
 CONFIG, RECORDINGS = "/etc/flockd/drone.yaml", Path("/var/lib/flockd")
 PORT, ENDPOINT = 14540, "tcp/127.0.0.1:7447"
@@ -80,7 +84,7 @@ class Service:
             state = shown("ActiveState")
         yield Finding("not ready without frames", state == "activating", state, "activating")
         freed_s = time.monotonic()
-        self._front = Feeder("mjpeg", FRONT_SIZE, RATE_HZ)
+        self._front = Feeder(FRONT_SIZE, RATE_HZ)
         starting.wait(PATIENCE_S)
         took_s, state = time.monotonic() - freed_s, shown("ActiveState")
         yield Finding(
@@ -203,7 +207,7 @@ class Service:
         )  # fmt: skip
         recording = Recording(max(RECORDINGS.glob("*.mcap"), key=lambda path: path.stat().st_mtime))
         decode = MjpegFormat(FRONT_SIZE).decode
-        known = {decode(image("mjpeg", FRONT_SIZE, number)).tobytes() for number in range(COUNT)}
+        known = {decode(image(FRONT_SIZE, number)).tobytes() for number in range(COUNT)}
         seen = [step.frames.frames["front"].image for step in recording.steps() if "front" in step.frames.frames]
         equal = sum(np.ascontiguousarray(one).tobytes() in known for one in seen)
         yield Finding(
@@ -269,3 +273,16 @@ def _told_since(time_s: float, what: str) -> float:
 
     until(reported, f"{what!r} in the journal", look_s=LOOK_S)
     return found[0]
+
+
+def main() -> None:
+    """All checks in their order."""
+    findings, start = map(Path, sys.argv[1:])
+    load()
+    service = Service(start.read_text(encoding="utf-8"))
+    run_checks(findings, service.checks)
+    service.close()
+
+
+if __name__ == "__main__":
+    main()
