@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from flockd import __version__
+from tests.review.replay.test_regression import tolerances
 from tools.checks.references import with_float_networks
 from tools.release import deb
 from tools.release.wheels import ROOT
@@ -55,12 +56,6 @@ BINFMT = Path("/proc/sys/fs/binfmt_misc")
 """What the kernel starts by another program."""
 INSTALL = "apt-get install --quiet --quiet --yes --no-install-recommends"
 SIMULATOR = "/usr/lib/flockd/lib/python*/site-packages/flockd/_data/config/simulator.yaml"
-TOLERANCES = (
-    *("velocity=1e-4", "command=0.002", "neighbours=0.015", "detections=0.003", "ego_motion=1e-4", "mission=1e-9"),
-    *("ego_motion.pairs=100", "ego_motion.inliers=100", "neighbours.possible.probability=0.05", "seen_m=1e-6"),
-    "detections.log_size_sigma=0.04",
-)
-"""Of tests/review/replay/test_regression.py."""
 NETWORKS = ("flow_int8", "neighbours_int8", "detector", "distance_int8", "verification_int8")
 AGAIN = "flockd replay /tmp/flight.mcap --config /tmp/drone.yaml --diff --reference /tmp/flight.expected"
 STEPS = (
@@ -69,9 +64,8 @@ STEPS = (
     ("flockd config check /etc/flockd/drone.yaml", ("/etc/flockd/drone.yaml: fine",)),
     # It fails steps that are too slow, as it should under emulation; of what is installed nothing may be wrong.
     (f"flockd doctor --config {SIMULATOR} || true", tuple(f"PASS     model {name}" for name in NETWORKS)),
-    # As on this computer's architecture, within tests/review/replay's tolerances.
     (
-        f"runuser -u flockd -- {AGAIN} {' '.join(f'--tolerance {one}' for one in TOLERANCES)}",
+        f"runuser -u flockd -- {AGAIN} {' '.join(tolerances(FLIGHT.stem))}",
         ("drone1: 10 steps", "equal in all "),
     ),
     ("systemd-analyze verify /usr/lib/systemd/system/flockd.service", ()),

@@ -50,11 +50,15 @@ OF_MISSION = "mission=1e-9"
 Capture = pytest.CaptureFixture[str]
 
 
+def tolerances(flight: str) -> list[str]:
+    """Options of `flockd replay`; `tools.release.check_emulated` gives them too."""
+    found = [*TOLERANCES_OF.get(flight, TOLERANCES), *OF_EGO_MOTION, *OF_MOTIONS, OF_SIZES, OF_MISSION]
+    return [f"--tolerance={tolerance}" for tolerance in found]
+
+
 def against_reference(flight: str, config: Path, expected: Path | None = None) -> int:
-    tolerances = [*TOLERANCES_OF.get(flight, TOLERANCES), *OF_EGO_MOTION, *OF_MOTIONS, OF_SIZES, OF_MISSION]
-    arguments = [part for tolerance in tolerances for part in ("--tolerance", tolerance)]
     reference = ["--diff", "--reference", str(expected or HERE / f"{flight}.expected")]
-    return main(["replay", str(HERE / f"{flight}.mcap"), "--config", str(config), *reference, *arguments])
+    return main(["replay", str(HERE / f"{flight}.mcap"), "--config", str(config), *reference, *tolerances(flight)])
 
 
 @pytest.mark.parametrize("flight", FLIGHTS)
