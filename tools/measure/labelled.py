@@ -150,7 +150,8 @@ def _told(path: Path, read: Callable[[], Any], wanted: str) -> Any:
         raise SystemExit(f"{path}: lacks or garbles {error}; give {wanted}") from None
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Prints the figures as JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("found", type=Path, help="what `flockd detect --json` printed")
     parser.add_argument("labels", type=Path, help="boxes in COCO's format")
@@ -160,3 +161,7 @@ if __name__ == "__main__":
     if not found["measured"]:
         raise SystemExit(f"{args.found}: has none of the pictures of {args.labels}; detect in the folder of the labels")
     print(json.dumps(found, indent=1))
+
+
+if __name__ == "__main__":
+    main()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,6 @@ from tools.measure.card import (
     SEEDS,
     Flight,
     Line,
-    _part,
     document,
     encounters,
     flights_of,
@@ -128,11 +126,6 @@ def test_encounters_are_told_by_speed_and_airframe_and_each_flies_with_a_seed_of
         for speed in (1.0, 2.0, 3.0)
         for airframe in ("trained", "unknown")
     ]
-
-
-def test_without_flights_by_sight_one_sentence_says_what_to_fly_before_their_errors(tmp_path: Path) -> None:
-    with pytest.raises(SystemExit, match=r"no log of a flight by sight; .*`--parts flights`"):
-        _part("errors", COMMIT, Namespace(quick=False, workers=1, results=tmp_path), {})
 
 
 @pytest.mark.parametrize("eyes", ["blind", "exact"])
