@@ -144,8 +144,10 @@ class Row:
         return steady and not self.ended and close and (self.closest_m is None or self.closest_m >= CLOSEST_M)
 
 
-def fly(flight: Flight, kind: AutopilotKind, speed_factor: float, out: Path) -> Row:
-    """Flies it and measures the row. Raises FlockdError."""
+def fly(
+    flight: Flight, kind: AutopilotKind, speed_factor: float, out: Path, watch: Callable[[int], None] = lambda _: None
+) -> Row:
+    """Flies it and measures the row; ``watch`` is called again and again with the seconds flown. Raises FlockdError."""
     endpoint = free_endpoint()
     sitl = load_drone(data_path("config") / SITL)
     sitl = sitl.model_copy(update={"telemetry": sitl.telemetry.model_copy(update={"connect": (endpoint,)})})
@@ -161,6 +163,7 @@ def fly(flight: Flight, kind: AutopilotKind, speed_factor: float, out: Path) -> 
         once.append((SET_ORIGIN_S, [program, "--instance", "0", "set_ekf_origin", *(f"{one:g}" for one in place)]))
 
     def progress(flown_s: int, of_s: int) -> None:
+        watch(flown_s)
         while once and flown_s >= once[0][0]:
             subprocess.Popen(once.pop(0)[1], stdout=subprocess.DEVNULL)
 
