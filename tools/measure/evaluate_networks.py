@@ -24,7 +24,6 @@ from flockd.core.data import data_path
 from flockd.core.messages import UNCLASSED, Detection, Frame, FrameSet, VehicleState
 from flockd.flight.geometry import RangeMap, Rig, RigCamera
 from flockd.flight.perception import DisFlow, OnnxNetworks, Perception
-from flockd.flight.perception.detection.detector import DetectionTrace
 from flockd.flight.pilot.ground import level_ground
 from flockd.sim.renderer.drone_models import FAMILIES, drone_model
 from tools.training.dataset import HEIGHT, R_BODY_CAMERA, WIDTH, PairSet, open_pairs, rig_camera
@@ -35,14 +34,14 @@ SIZES_M = [drone_model(family, 0).size_m for family in range(FAMILIES)]
 MIN_PIXELS = 6
 """Drones of which less is to be seen do not count, neither as found nor as missed."""
 MASK_WITHIN_M = 10.0
-HEIGHT_SIGMAS_M = {"barometer": 0.1, "range finder": 0.03}
-"""Standard deviations of the height above ground that an autopilot gives, by what it measures it with."""
+HEIGHT_SIGMA_M = 0.1
+"""Standard deviation of the height above ground that an autopilot gives, by its barometer."""
 WHOLE_HIDES = 0.02
 """A drone is whole when it is inside the image and no more of its outline is hidden than this."""
 RANGES_M = ((1.5, 5.0), (5.0, 10.0), (10.0, 20.0))
-WITH: dict[str | None, str] = {
-    None: "RGB alone",
-    **{given: f"attitude, height by {given} ({sigma:g} m)" for given, sigma in HEIGHT_SIGMAS_M.items()},
+WITH: dict[ScaleSource, str] = {
+    "network": "RGB alone",
+    "height": f"attitude, height by barometer ({HEIGHT_SIGMA_M:g} m)",
 }
 """What the scale of depth comes from."""
 
@@ -78,8 +77,6 @@ def main() -> None:
     rows = list(rows_of_pairs(look_at_pairs(open_pairs(arguments.data), perception)))
     if arguments.unseen is not None:
         rows += list(_distances(look_at_pairs(open_pairs(arguments.unseen), perception), ", unseen families"))
-    files = list(arguments.models.glob("*.onnx"))
-    rows.append(Row("all networks", sum(file.stat().st_size for file in files) / 1e6, "MB", len(files)))
     for row in rows:
         print(row)
 
@@ -98,9 +95,8 @@ def rows_of_pairs(found: Findings) -> Iterator[Row]:
     yield Row(f"mask IoU, drones within {MASK_WITHIN_M:g} m, mean", float(np.mean(found.iou)), "", len(found.iou))
     for low, high, name in ((12, np.inf, "at least 12"), (6, 12, "6 to 12")):
         wide = [drone for drone in found.drones if low <= drone.width_px < high]
-        counts = {"found": sum(d.found for d in wide), "proposed": sum(d.found or d.proposed for d in wide)}
-        for what, count in counts.items():
-            yield Row(f"drones whose box is {name} px wide, {what}", 100 * count / max(len(wide), 1), "%", len(wide))
+        share = 100 * sum(drone.found for drone in wide) / max(len(wide), 1)
+        yield Row(f"drones whose box is {name} px wide, found", share, "%", len(wide))
     yield Row("false drones in 500 images", 500 * found.false / found.images, "", found.images)
     errors = {key: np.concatenate(parts) for key, parts in found.flow.items()}
     for on_drones, where in ((False, "background"), (True, "drones")):
@@ -136,8 +132,6 @@ class Drone:
     """Relative error of its range; 0 where it was not found."""
     sigma: float
     """What was said of that error's standard deviation."""
-    proposed: bool = True
-    """Whether the second stage was asked about it: some proposal is no farther from it than the drone is large."""
 
 
 class Findings:
@@ -149,41 +143,34 @@ class Findings:
         """Detections that are no drone's, or a drone's second one."""
         self.drones: list[Drone] = []
         self.iou: list[float] = []
-        self.depth: dict[str | None, list[float]] = {given: [] for given in (None, *HEIGHT_SIGMAS_M)}
-        """Mean relative error of the background's depth in each image, by what measured the height, None: RGB alone."""
+        self.depth: dict[ScaleSource, list[float]] = {scale: [] for scale in WITH}
+        """Mean relative error of the background's depth in each image, by what gave the scale."""
         self.flow: dict[tuple[str, bool], list[Array]] = {}
         """End-point errors, px, of ("network" or "dis", on drones)."""
 
 
 def look_at_pairs(pairs: PairSet, networks: OnnxNetworks) -> Findings:
-    """The second stage and all, on each pair's first image; the flow on both. The autopilot's height errs.
-
-    Drones are what they are with a barometer.
-    """
+    """The second stage and all, on each pair's first image; the flow on both. Drones: with the autopilot's height."""
     rng = np.random.Generator(np.random.PCG64(0))
     dis, found = DisFlow(), Findings()
     for index in range(pairs.count):
         rig = Rig({"camera": rig_camera(float(pairs["focal"][index]))})
         images = np.asarray(pairs["image"][index])
         R_ned_camera = np.asarray(pairs["R_ned_camera"][index, 0], np.float64)
-        height, wrong = float(pairs["height"][index, 0]), float(rng.standard_normal())
+        measured_m = float(pairs["height"][index, 0]) + HEIGHT_SIGMA_M * float(rng.standard_normal())
+        vehicle = VehicleState(0.0, R_ned_camera @ R_BODY_CAMERA.T, measured_m)
         frames = FrameSet(0.0, {"camera": Frame("camera", images[0], 0.0, 0)})
         depth, ids = np.asarray(pairs["depth"][index][0], np.float32), np.asarray(pairs["ids"][index][0])
-        for given in (None, "range finder", "barometer"):
-            scale: ScaleSource = "network" if given is None else "height"
-            measured_m = height + HEIGHT_SIGMAS_M.get(given or "", 0.0) * wrong
-            vehicle = VehicleState(0.0, R_ned_camera @ R_BODY_CAMERA.T, measured_m)
-            trace = DetectionTrace()
+        for scale in WITH:
             perception = Perception(rig, networks, PerceptionConfig(scale=scale))
-            view = perception.observe(frames, vehicle, level_ground(vehicle), trace=trace)
+            view = perception.observe(frames, vehicle, level_ground(vehicle))
             ranges = view.cameras["camera"].depth
             assert ranges is not None
             off = depth_errors(RangeMap(ranges), rig.cameras["camera"], depth, ids)
-            found.depth[given].append(float(off.mean()) if off.size else 0.0)
+            found.depth[scale].append(float(off.mean()) if off.size else 0.0)
         labels = view.cameras["camera"].labels
         _masks(((labels > 0) & (labels != UNCLASSED))[1::2, 1::2], ids, pairs, index, found)
-        proposed = [proposal.roi.direction for proposal in trace.proposals]
-        compare_drones(view.detections, pairs, index, depth, ids, found, proposed)
+        compare_drones(view.detections, pairs, index, depth, ids, found)
         flow = np.asarray(pairs["flow"][index], np.float32)
         valid = np.asarray(pairs["flow_valid"][index])
         first, second = (Frame("camera", images[k], 0.5 * k, k) for k in (0, 1))
@@ -224,18 +211,14 @@ def compare_drones(
     depth: Array,
     ids: Array,
     found: Findings,
-    proposed: Sequence[Array] = (),
 ) -> None:
-    """Note every drone of a pair's first image: a detection is a drone's if it lies in its direction, at any range.
-
-    ``proposed``: unit vectors (3,) towards what the second stage was asked about.
-    """
+    """Note every drone of a pair's first image: a detection is a drone's if it lies in its direction, at any range."""
     found.images += 1
     seen = np.flatnonzero(pairs["drone_pixels"][index, 0] >= MIN_PIXELS)
     places = [R_BODY_CAMERA @ np.asarray(pairs["drone_centre"][index, 0, drone], np.float64) for drone in seen]
     sizes_m = [SIZES_M[int(pairs["drone_family"][index, drone])] for drone in seen]
     detection_of = pairings(detections, places, sizes_m)
-    for row, (drone, true, size_m) in enumerate(zip(seen, places, sizes_m, strict=True)):
+    for row, (drone, true) in enumerate(zip(seen, places, strict=True)):
         range_m, best = float(np.linalg.norm(true)), detection_of.get(row)
         left, top, right, bottom = pairs["drone_box"][index, 0, drone]
         inside = left > 1 and top > 1 and right < WIDTH - 1 and bottom < HEIGHT - 1
@@ -244,8 +227,7 @@ def compare_drones(
             distance = float(np.linalg.norm(best.position))
             error, sigma = distance / range_m - 1.0, best.range_sigma_m / distance
         whole = inside and _hidden_share(pairs, index, int(drone), depth, ids) < WHOLE_HIDES
-        drone_found, asked = best is not None, any(_angle(one, true) <= size_m / range_m for one in proposed)
-        found.drones.append(Drone(range_m, float(right - left), bool(whole), drone_found, error, sigma, asked))
+        found.drones.append(Drone(range_m, float(right - left), bool(whole), best is not None, error, sigma))
     found.false += len(detections) - len(detection_of)
 
 

@@ -142,7 +142,31 @@ class NeighboursNet(nn.Module):
         return depth, out[:, 1:2], out[:, 2:4] * OFFSET_SCALE_PX
 
 
-class DistanceNet(nn.Module):
+class _CropEncoder(nn.Module):
+    """Features of crops of 96 x 96 pixels, at a half to a 32nd of that size; `distance` and `verification` each learn
+    their own."""
+
+    widths = (24, 40, 64, 96, 128)
+
+    def __init__(self) -> None:
+        super().__init__()
+        w = self.widths
+        self.stem = _conv(12, w[0])  # 48
+        self.down = nn.ModuleList([_conv(a, b, stride=2) for a, b in pairwise(w)])  # 24, 12, 6, 3
+        self.body = nn.ModuleList([_Residual(b) for b in w[1:]])
+        self.more = nn.ModuleDict({str(i): _Residual(w[i]) for i in (2, 3)})
+
+    def levels(self, picture: Tensor) -> list[Tensor]:
+        """The features of (n, 96, 96, 3) uint8, the finest first."""
+        x = self.stem(_blocks(picture)) if self.training else _on_entry(self.stem, _entry(picture))
+        found = [x]
+        for i, (down, body) in enumerate(zip(self.down, self.body, strict=True), start=1):
+            x = body(down(found[-1]))
+            found.append(self.more[str(i)](x) if str(i) in self.more else x)
+        return found
+
+
+class DistanceNet(_CropEncoder):
     """Range of the drone in the middle of a crop.
 
     Maps of half the crop's size say where its four motors are, from the leftmost to the rightmost; how far they lie
@@ -157,8 +181,6 @@ class DistanceNet(nn.Module):
     pixel the logit of being this drone's.
     """
 
-    size = 96
-    widths = (24, 40, 64, 96, 128)
     motors = 4
     maps = 8
     """The first are of the motors; what the others look for is learnt."""
@@ -166,10 +188,6 @@ class DistanceNet(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         w = self.widths
-        self.stem = _conv(12, w[0])  # 48
-        self.down = nn.ModuleList([_conv(a, b, stride=2) for a, b in pairwise(w)])  # 24, 12, 6, 3
-        self.body = nn.ModuleList([_Residual(b) for b in w[1:]])
-        self.more = nn.ModuleDict({str(i): _Residual(w[i]) for i in (2, 3)})
         self.lateral = nn.ModuleList([nn.Conv2d(a, a, 1) for a in w[:4]])
         self.up = nn.ModuleList([_conv(b, a, kernel=1) for a, b in pairwise(w)])
         self.merge = nn.ModuleList([_conv(a, a) for a in w[:4]])
@@ -189,12 +207,8 @@ class DistanceNet(nn.Module):
 
         In training also a logit for each family, and log maps of the motors (n, 4, 48 * 48).
         """
-        x = self.stem(_blocks(picture)) if self.training else _on_entry(self.stem, _entry(picture))
-        levels = [x]
-        for i, (down, body) in enumerate(zip(self.down, self.body, strict=True), start=1):
-            x = body(down(x))
-            levels.append(self.more[str(i)](x) if str(i) in self.more else x)
-            x = levels[-1]
+        levels = self.levels(picture)
+        x = levels[-1]
         whole = x.flatten(1)
         for i in reversed(range(len(self.merge))):
             x = F.interpolate(self.up[i](x), scale_factor=2.0, mode="nearest")
@@ -215,36 +229,23 @@ class DistanceNet(nn.Module):
         return out, mask, _in_full_precision(self.family, x), where[:, : self.motors].flatten(2).log_softmax(2)
 
 
-class VerificationNet(nn.Module):
+class VerificationNet(_CropEncoder):
     """Whether there is a drone in the middle of a crop.
 
-    The encoder is the one of ``DistanceNet``, trained apart from it: what tells a drone from a bird or a branch has to
-    be learnt from soft real photographs, of which nobody knows a range.
+    It is trained apart from ``DistanceNet``: what tells a drone from a bird or a branch has to be learnt from soft real
+    photographs, of which nobody knows a range.
 
     Input: `crop` (n, 96, 96, 3) uint8, as ``DistanceNet`` takes it. Output (n, 1): logit of there being a drone.
     """
 
-    size = DistanceNet.size
-    widths = DistanceNet.widths
-    hidden = 160
-
     def __init__(self) -> None:
         super().__init__()
-        w = self.widths
-        self.stem = _conv(12, w[0])
-        self.down = nn.ModuleList([_conv(a, b, stride=2) for a, b in pairwise(w)])
-        self.body = nn.ModuleList([_Residual(b) for b in w[1:]])
-        self.more = nn.ModuleDict({str(i): _Residual(w[i]) for i in (2, 3)})
-        self.summary = nn.Sequential(nn.Linear(w[-1] * 9, self.hidden), nn.ReLU(True), nn.Dropout(0.2))
-        self.head = nn.Linear(self.hidden, 1)
+        self.summary = nn.Sequential(nn.Linear(self.widths[-1] * 9, 160), nn.ReLU(True), nn.Dropout(0.2))
+        self.head = nn.Linear(160, 1)
 
     def forward(self, crop: Tensor) -> Tensor:
         """One logit (n, 1) a crop."""
-        x = self.stem(_blocks(crop)) if self.training else _on_entry(self.stem, _entry(crop))
-        for i, (down, body) in enumerate(zip(self.down, self.body, strict=True), start=1):
-            x = body(down(x))
-            x = self.more[str(i)](x) if str(i) in self.more else x
-        return _in_full_precision(self.head, self.summary(x.flatten(1)))
+        return _in_full_precision(self.head, self.summary(self.levels(crop)[-1].flatten(1)))
 
 
 def _moments(where: Tensor) -> tuple[Tensor, Tensor]:
@@ -329,7 +330,7 @@ class FlowNet(nn.Module):
         self.delta = nn.Sequential(nn.Conv2d(self.hidden, 64, 3, 1, 1), nn.ReLU(True), nn.Conv2d(64, 2, 3, 1, 1))
         self.mask = nn.Sequential(nn.Conv2d(self.hidden, 96, 3, 1, 1), nn.ReLU(True), nn.Conv2d(96, 9 * 64, 1))
 
-    def forward(self, first: Tensor, second: Tensor, iterations: int | None = None) -> Tensor | list[Tensor]:
+    def forward(self, first: Tensor, second: Tensor) -> Tensor | list[Tensor]:
         """The last flow, or in training all of them."""
         both = torch.cat([first, second], 0).permute(0, 3, 1, 2).float() / 127.5 - 1.0
         features = self.encoder(both)
@@ -345,14 +346,13 @@ class FlowNet(nn.Module):
         flows: list[Tensor] = []
         if self.training:
             flows.append(F.interpolate(flow * 8.0, scale_factor=8.0, mode="bilinear", align_corners=False))
-        steps = iterations or self.iterations
-        for step in range(steps):
+        for step in range(self.iterations):
             flow = flow.detach()
             found = self.correlation(self._lookup(pyramid, grid + flow, n, h, w))
             motion = self.fuse(torch.cat([found, self.motion(flow)], 1))
             hidden = self.gru(hidden, torch.cat([context, motion, flow], 1))
             flow = flow + self.delta(hidden)
-            if self.training or step == steps - 1:
+            if self.training or step == self.iterations - 1:
                 flows.append(self._upsample(flow, hidden, n, h, w))
         return flows if self.training else flows[-1]
 

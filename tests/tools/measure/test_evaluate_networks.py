@@ -6,8 +6,7 @@ import numpy as np
 
 from flockd.core.messages import Detection
 from flockd.flight.geometry import log_polar, log_polar_covariance
-from tools.measure.evaluate_networks import Findings, compare_drones, pairings
-from tools.training.dataset import HEIGHT, WIDTH, PairSet
+from tools.measure.evaluate_networks import pairings
 
 
 def detection(*position: float) -> Detection:
@@ -27,24 +26,3 @@ def test_one_detection_is_not_two_drones_and_none_is_found_in_another_direction(
     near, far = np.array([2.0, 0.0, 0.0]), np.array([10.0, 0.1, 0.0])
     assert list(pairings((detection(9.0, 0.09, 0.0),), [near, far], [0.5, 0.5])) == [1]
     assert not pairings((detection(0.0, 2.0, 0.0),), [near, far], [0.5, 0.5])
-
-
-def test_a_drone_is_proposed_where_the_second_stage_was_asked_about_its_direction() -> None:
-    """Two drones are 10 m ahead and 2 m apart, without a detection: only the one is proposed that a proposal points
-    to."""
-    depth, ids = np.full((HEIGHT // 2, WIDTH // 2), 80.0, np.float32), np.zeros((HEIGHT // 2, WIDTH // 2), np.uint8)
-    pairs = PairSet(
-        {
-            "focal": np.array([320.0]),
-            "drone_pixels": np.array([[[50, 50]]]),
-            "drone_family": np.array([[0, 0]]),
-            "drone_box": np.array([[[[310, 230, 330, 250], [374, 230, 394, 250]]]]),
-            "drone_centre": np.array([[[[0.0, 0.0, 10.0], [2.0, 0.0, 10.0]]]]),
-            "drone_rotation": np.broadcast_to(np.eye(3), (1, 1, 2, 3, 3)),
-        },
-        1,
-    )
-    found = Findings()
-    compare_drones((), pairs, 0, depth, ids, found, [np.array([1.0, 0.0, 0.0])])
-    assert [drone.proposed for drone in found.drones] == [True, False]
-    assert [drone.found for drone in found.drones] == [False, False]
