@@ -65,7 +65,7 @@ coverage: $(VENV)/test.installed ### which branches of the safety layer its test
 	$(BIN)/python -m coverage run --branch --source=flockd/flight/safety -m pytest tests/flight/safety
 	$(BIN)/python -m coverage report --show-missing --fail-under=100
 
-breakages: $(VENV)/test.installed ### break flockd on purpose in 77 places, and see that a test notices each, in about 3 minutes
+breakages: $(VENV)/test.installed ### break flockd on purpose in some eighty places, and see that a test notices each, in about 3 minutes
 	$(BIN)/python -m tools.checks.breakages
 
 MUTANTS ?= 0
