@@ -30,10 +30,10 @@ LINES = {
     "flockd/campaign": 1_450,
     "flockd/cli": 3_820,
     "tests": 39_370,
-    "tools/checks": 1_860,
+    "tools/checks": 1_710,
     "tools/docs": 1_000,
-    "tools/measure": 1_540,
-    "tools/release": 620,
+    "tools/measure": 1_520,
+    "tools/release": 610,
     "tools/training": 4_330,
 }
 """Lines of Python below a folder."""

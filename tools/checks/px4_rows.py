@@ -1,8 +1,8 @@
-"""Flies PX4 SITL by real daemons and prints one row a flight: what was ordered, and how closely it was flown.
+"""Flies PX4 SITL by real daemons and prints a line of JSON for each flight: how closely it flew what was ordered.
 
     FLOCKD_PX4=~/PX4-Autopilot/build/px4_sitl_default python -m tools.checks.px4_rows
     python -m tools.checks.px4_rows --only hover north --out out/px4_rows
-    python -m tools.checks.px4_rows --autopilot fake --json
+    python -m tools.checks.px4_rows --autopilot fake
 
 The first flights run at real time. Their drones have two cameras of 128 x 96 pixels and the autopilot's own velocity,
 so that two cores carry them; they see nobody, and keep apart by what each is ordered. `by_sight` and `by_sight_busy`
@@ -247,17 +247,8 @@ def _scenario(flight: Flight, folder: Path) -> ScenarioConfig:
     return load_scenario(path)
 
 
-def _line(row: Row) -> str:
-    closest = "-" if row.closest_m is None else f"{row.closest_m:.2f} m"
-    return (
-        f"{row.flight:15}{row.speed_factor:>5g}{row.off_m_s:>9.3f}{row.truly_off_m_s:>9.3f}{row.order:>9.4f}{closest:>9}"
-        f"{row.longest_step_s:>7.2f} s  {'kept' if row.kept else 'NOT KEPT':9} "
-        f"{'; '.join(filter(None, (row.goals, row.modes, row.ended)))}"
-    )
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Prints a table, or JSON."""
+    """Prints a line of JSON a flight."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--autopilot", choices=get_args(AutopilotKind), default="px4")
     parser.add_argument(
@@ -267,7 +258,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, help="keep logs in this folder")
     named = {flight.name: flight for flight in (*FLIGHTS, *MISSIONS)}
     parser.add_argument("--only", nargs="+", choices=named, help="these alone (default: all but the last three)")
-    parser.add_argument("--json", action="store_true", help="print JSON")
     args = parser.parse_args(arguments)
     try:
         if args.autopilot == "px4":
@@ -275,28 +265,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except FlockdError as error:
         print(error, file=sys.stderr)
         return int(error.exit_code)
-    if not args.json:
-        columns = f"{'speed':>5}{'off m/s':>9}{'truly':>9}{'order':>9}{'closest':>9}{'longest':>9}"
-        print(f"{'flight':15}{columns}{'':11}modes", flush=True)
-    chosen = FLIGHTS if args.only is None else [named[name] for name in args.only]
-    rows = _fly_all(chosen, args, lambda row: None if args.json else print(_line(row), flush=True))
-    if args.json:
-        print(json.dumps({"flights": [{**vars(row), "kept": row.kept} for row in rows]}, indent=2))
-    return 0 if all(row.kept for row in rows) else 1
-
-
-def _fly_all(flights: Sequence[Flight], args: argparse.Namespace, told: Callable[[Row], None]) -> list[Row]:
-    found: list[Row] = []
-    with ExitStack() as stack:
-        out = args.out or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="flockd-")))
-        for flight in flights:
+    kept = True
+    with tempfile.TemporaryDirectory(prefix="flockd-") as folder:
+        for flight in FLIGHTS if args.only is None else [named[name] for name in args.only]:
+            speed_factor = args.speed_factor if flight.by_sight else 1.0
             try:
-                row = fly(flight, args.autopilot, args.speed_factor if flight.by_sight else 1.0, out / flight.name)
+                row = fly(flight, args.autopilot, speed_factor, (args.out or Path(folder)) / flight.name)
             except FlockdError as error:
                 row = Row(flight.name, 0.0, np.nan, np.nan, np.nan, None, np.nan, "never flew", str(error), None)
-            found.append(row)
-            told(row)
-    return found
+            kept = kept and row.kept
+            print(json.dumps({**vars(row), "kept": row.kept}), flush=True)
+    return 0 if kept else 1
 
 
 if __name__ == "__main__":

@@ -174,7 +174,6 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, help="of each flight, but of those of their file's length (head-on)")
     parser.add_argument("--results", type=Path, default=ROOT / "out" / "ablate.jsonl", help="default: out/ablate.jsonl")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="mechanisms flown at once")
-    parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
     try:
         mechanisms = listed(arguments.only)
@@ -194,7 +193,7 @@ def main() -> int:
         list(pool.map(fly, [AS_IT_IS, *mechanisms]))
     lines = [one for one in read_lines(results) if one["commit"] == commit and one["failed"] is None]
     rows = [row_of(one, [line for line in lines if tuple(line["plan"]) in plans]) for one in mechanisms]
-    print(json.dumps(rows, indent=1)) if arguments.json else show(rows)
+    show(rows)
     return 0
 
 

@@ -66,10 +66,9 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True, help="folder of render_training_data.py")
     parser.add_argument("--unseen", type=Path, help="another one, with families that no network was trained on")
     parser.add_argument("--models", type=Path, default=data_path("models"))
-    parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--float", action="store_true", help="the float networks, not their 8-bit twins")
     arguments = parser.parse_args()
-    config = PerceptionConfig(threads=arguments.threads)
+    config = PerceptionConfig(threads=2)
     if arguments.float:
         config = config.model_copy(update={role: getattr(config, role).removesuffix("_int8") for role in ROLES})
     perception = OnnxNetworks(config, arguments.models)

@@ -141,14 +141,9 @@ def fit(samples: Mapping[str, Samples], families: Mapping[str, int | str]) -> di
     if lacking := [name for name, flights in of.items() if not flights]:
         raise ValueError(f"no flight with {lacking[0]} airframes; fly them too (`--airframe`)")
     by_distance = {name: _by_distance(flights) for name, flights in of.items()}
-    by_family = {
-        family: [one for name, one in samples.items() if families[name] == family]
-        for family in sorted(set(families.values()), key=str)
-    }
     return {
         "detections": {name: _detections(flights, by_distance[name]) for name, flights in of.items()},
         "by_distance": by_distance,
-        "by_airframe": {name: _errors(flights, 0.0, NEAR_M) for name, flights in by_family.items()},
     }
 
 

@@ -88,10 +88,10 @@ def main() -> int:
     return DONE
 
 
-def build(out: Path, arch: str, system: str, version: str, *, shelf: Path | None = None, level: int = 9) -> Path:
+def build(out: Path, arch: str, system: str, version: str, *, level: int = 9) -> Path:
     """Writes the package into ``out`` and gives its path.
 
-    ``shelf``: a folder that has the lock's wheels for that system already. ``level``: of compression, 1 to 19.
+    ``level``: of compression, 1 to 19.
     Raises UnavailableError where dpkg or a time is missing, CalledProcessError where pip or dpkg fails.
     """
     if shutil.which("dpkg-deb") is None:
@@ -101,11 +101,9 @@ def build(out: Path, arch: str, system: str, version: str, *, shelf: Path | None
     out.mkdir(parents=True, exist_ok=True)
     file = out / f"flockd_{full_version}_{arch}.deb"
     with tempfile.TemporaryDirectory() as scratch:
-        tree, own = Path(scratch) / "tree", Path(scratch) / "own"
+        tree, own, shelf = (Path(scratch) / name for name in ("tree", "own", "wheels"))
         python = SYSTEMS[system].python
-        if shelf is None:
-            shelf = Path(scratch) / "wheels"
-            wheels.download_locked(shelf, machine=MACHINES[arch], python=python)
+        wheels.download_locked(shelf, machine=MACHINES[arch], python=python)
         _environment(tree, [*wheels.locked(shelf), wheels.build_own(own, shelf)], python)
         _system_files(tree)
         _documents(tree, full_version, epoch_s)
