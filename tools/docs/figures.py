@@ -179,10 +179,15 @@ def _px4(parts: Mapping[str, Part]) -> str:
 
 
 def _px4_stories(parts: Mapping[str, Part]) -> str:
-    told: dict[str, list[str]] = {}
+    """By how they ended; of one story with several cases these in brackets."""
+    told: dict[str, dict[str, list[str]]] = {}
     for story, end in parts["px4_stories"]["found"].items():
-        told.setdefault(end, []).append(story)
-    rows = [(f"{len(stories)} {end}", "; ".join(stories)) for end, stories in told.items()]
+        name, _, case = story.rstrip("]").partition("[")
+        told.setdefault(end, {}).setdefault(name, []).append(case)
+    rows = []
+    for end, stories in told.items():
+        names = [f"{name} ({', '.join(cases)})" if any(cases) else name for name, cases in stories.items()]
+        rows.append((f"{sum(map(len, stories.values()))} {end}", "; ".join(names)))
     return _table(("with PX4", "stories"), rows) + "\n" + _origin(parts["px4_stories"])
 
 

@@ -19,10 +19,8 @@ import argparse
 import os
 import platform
 import shutil
-import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -30,6 +28,7 @@ from flockd import __version__
 from tests.review.replay.test_regression import tolerances
 from tools.checks.references import with_float_networks
 from tools.release import deb
+from tools.release.check_wheel import run
 from tools.release.wheels import ROOT
 
 FLIGHT = Path("tests/review/replay/normal.mcap")
@@ -88,13 +87,13 @@ def main() -> int:
     with tempfile.TemporaryDirectory(prefix="flockd-system-") as name:
         system = Path(name) / "system"
         options = ["--variant=minbase", f"--arch={args.arch}", f"--keyring={suite.keyring}"]
-        _run(["debootstrap", *options, suite.name, str(system), args.mirror or suite.mirror, suite.script])
+        run(["debootstrap", *options, suite.name, str(system), args.mirror or suite.mirror, suite.script], Path(name))
         deb.build(system / "tmp", args.arch, args.system, __version__, level=1)
         shutil.copy(ROOT / FLIGHT, system / "tmp/flight.mcap")
         shutil.copy((ROOT / FLIGHT).with_suffix(".expected"), system / "tmp/flight.expected")
         with_float_networks(ROOT / FLIGHT, system / "tmp/drone.yaml")
         for command, shows in STEPS:
-            _run(_within(system, command), shows)
+            run(_within(system, command), Path(name), shows)
     print(f"{args.system} on {args.arch}: flockd is installed, sees its golden inputs, flies ten steps, and goes again")
     return deb.DONE
 
@@ -116,27 +115,9 @@ def _missing(arch: str, suite: Suite) -> str | None:
 def _within(system: Path, command: str) -> list[str]:
     """A shell's command in the system, with processes and a /proc of its own that end with it. Not with /sys: libraries
     look at this computer's processors there, and crash."""
-    environment = (
-        "env",
-        "-i",
-        "PATH=/usr/sbin:/usr/bin:/sbin:/bin",
-        "LC_ALL=C.UTF-8",
-        "DEBIAN_FRONTEND=noninteractive",
-    )
+    variables = ("PATH=/usr/sbin:/usr/bin:/sbin:/bin", "LC_ALL=C.UTF-8", "DEBIAN_FRONTEND=noninteractive")
     alone = ("unshare", "--mount", "--pid", "--fork", f"--root={system}", "--mount-proc")
-    return [*alone, *environment, "sh", "-c", command]
-
-
-def _run(command: Sequence[str], shows: Sequence[str] = ()) -> None:
-    """Raises SystemExit where it fails or does not show what it should."""
-    print(f"$ {command[-1] if shows or command[0] == 'unshare' else ' '.join(command)}", flush=True)
-    ended = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
-    print(ended.stdout, end="", flush=True)
-    if ended.returncode != 0:
-        raise SystemExit(f"check_emulated: {command[-1]} ended with exit code {ended.returncode}")
-    for text in shows:
-        if text not in ended.stdout:
-            raise SystemExit(f"check_emulated: {command[-1]} did not show {text!r}")
+    return [*alone, "env", "-i", *variables, "sh", "-c", command]
 
 
 if __name__ == "__main__":

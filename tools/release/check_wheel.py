@@ -15,8 +15,8 @@ import subprocess
 import sys
 import tempfile
 import venv
+from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 from flockd import __version__
 from tools.release.wheels import ROOT
@@ -25,29 +25,19 @@ PICTURE = ROOT / "tests/ground/pictures/rendered/4_m_4.jpg"
 """One drone."""
 
 
-class Step(NamedTuple):
-    """A command of the installed package, run in a folder that has nothing else."""
-
-    arguments: tuple[str, ...]
-    shows: str = ""
-    """What its output has to have."""
-    codes: tuple[int, ...] = (0,)
-    """Exit codes that are well."""
-
-
 STEPS = (
-    Step(("--version",), f"flockd {__version__}"),
-    Step(("models", "verify")),
-    Step(("config", "check", "{data}/config/simulator.yaml")),
-    Step(("sim", "--perception", "truth", "--duration", "2", "--drones", "3", "--out", "{folder}/flight")),
-    Step(("detect", "--fov", "90", "{folder}/picture.jpg"), "detections: 1, images: 1"),
+    ("--version", (f"flockd {__version__}",)),
+    ("models verify", ()),
+    ("config check {data}/config/simulator.yaml", ()),
+    ("sim --perception truth --duration 2 --drones 3 --out {folder}/flight", ()),
+    ("detect --fov 90 {folder}/picture.jpg", ("detections: 1, images: 1",)),
     # It fails a step that is too slow, as it should on a busy computer; of what is installed nothing may be wrong.
-    Step(
-        ("doctor", "--config", "{data}/config/simulator.yaml"),
-        "PASS     model verification_int8  hash and golden output",
-        (0, 1),
+    (
+        "doctor --config {data}/config/simulator.yaml || true",
+        ("PASS     model verification_int8  hash and golden output",),
     ),
 )
+"""What the installed command is given, in a folder that has nothing else, and what it has to print."""
 
 
 def main() -> int:
@@ -62,31 +52,33 @@ def main() -> int:
         for environment in (tools, alone):
             venv.create(environment, with_pip=True)
         install = ("-m", "pip", "install", "--quiet", "--no-compile")  # which takes longer than to compile what is used
-        _run(folder, tools / "bin/python", *install, "build", "twine")
-        _run(folder, tools / "bin/python", "-m", "build", "--outdir", str(out), str(ROOT))
+        run([str(tools / "bin/python"), *install, "build", "twine"], folder)
+        run([str(tools / "bin/python"), "-m", "build", "--outdir", str(out), str(ROOT)], folder)
         built = [out / f"flockd-{__version__}.tar.gz", out / f"flockd-{__version__}-py3-none-any.whl"]
-        _run(folder, tools / "bin/twine", "check", "--strict", *map(str, built))
-        _run(folder, alone / "bin/python", *install, f"{built[1]}[sim]")
+        run([str(tools / "bin/twine"), "check", "--strict", *map(str, built)], folder)
+        run([str(alone / "bin/python"), *install, f"{built[1]}[sim]"], folder)
         (data,) = alone.glob("lib/python*/site-packages/flockd/_data")
         shutil.copy(PICTURE, folder / "picture.jpg")
-        for step in STEPS:
-            words = [word.format(data=data, folder=folder) for word in step.arguments]
-            _run(folder, alone / "bin/flockd", *words, shows=step.shows, codes=step.codes)
+        for words, shows in STEPS:
+            run(["sh", "-c", f"{alone}/bin/flockd {words.format(data=data, folder=folder)}"], folder, shows)
     print(f"{built[0]} and {built[1]} are whole: installed alone, the wheel has flown")
     return 0
 
 
-def _run(folder: Path, program: Path, *arguments: str, shows: str = "", codes: tuple[int, ...] = (0,)) -> None:
-    """Raises SystemExit where it fails or does not show what it should. Nothing of the checkout is found by it."""
-    print(f"$ {program.name} {' '.join(arguments)}", flush=True)
+def run(command: Sequence[str], folder: Path, shows: Sequence[str] = ()) -> None:
+    """Runs it in a folder. Raises SystemExit where it fails or does not print what it should.
+
+    Nothing of the checkout is found by it.
+    """
+    print(f"$ {' '.join(command)}", flush=True)
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    command = [str(program), *arguments]
     ended = subprocess.run(command, cwd=folder, env=environment, stdout=subprocess.PIPE, text=True, check=False)
     print(ended.stdout, end="", flush=True)
-    if ended.returncode not in codes:
-        raise SystemExit(f"check_wheel: {program.name} {' '.join(arguments)} ended with exit code {ended.returncode}")
-    if shows not in ended.stdout:
-        raise SystemExit(f"check_wheel: {program.name} {' '.join(arguments)} did not show {shows!r}")
+    if ended.returncode:
+        raise SystemExit(f"{' '.join(command)} ended with exit code {ended.returncode}")
+    for text in shows:
+        if text not in ended.stdout:
+            raise SystemExit(f"{' '.join(command)} did not show {text!r}")
 
 
 if __name__ == "__main__":
