@@ -25,4 +25,4 @@ def test_a_far_drone_keeps_its_detection_though_it_lies_within_a_near_ones_outli
 def test_one_detection_is_not_two_drones_and_none_is_found_in_another_direction() -> None:
     near, far = np.array([2.0, 0.0, 0.0]), np.array([10.0, 0.1, 0.0])
     assert list(pairings((detection(9.0, 0.09, 0.0),), [near, far], [0.5, 0.5])) == [1]
-    assert not pairings((detection(0.0, 2.0, 0.0),), [near, far], [0.5, 0.5])
+    assert not pairings((detection(10.0, 0.6, 0.0),), [near, far], [0.1, 0.5]), "half a metre beside it, twice its half"

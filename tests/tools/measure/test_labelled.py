@@ -21,12 +21,16 @@ def test_of_two_boxes_a_detection_takes_the_one_that_it_fits_best_and_each_is_fo
     wide = (0.0, 0.0, 60.0, 40.0)
     assert match([BOX, (25.0, 15.0, 45.0, 35.0)], [wide, BOX], middle_inside) == [1, 0]
     assert match([BOX, (25.0, 15.0, 45.0, 35.0)], [wide, BOX], half_overlap) == [1, None]
+    assert half_overlap(moved(6), BOX) == pytest.approx(14 / 26)
+    assert half_overlap(moved(7), BOX) == -1.0, "13 / 27"
     assert match([moved(2), BOX, moved(50)], [BOX, (100.0, 100.0, 110.0, 105.0)], middle_inside) == [0, None, None]
 
 
 def test_average_precision_by_hand() -> None:
     """Three boxes: hit, miss, hit. Precision 1 at recall 1/3, 2/3 at 2/3: area 1/3 + 2/9. The third is not found."""
     assert average_precision([(0.7, True), (0.9, True), (0.8, False)], 3) == pytest.approx(1 / 3 + 2 / 9)
+    # At each recall the best precision from there on counts: 2/3 at both hits after a miss.
+    assert average_precision([(0.9, False), (0.8, True), (0.7, True)], 2) == pytest.approx(2 / 3)
     assert average_precision([], 3) == 0.0
     assert average_precision([(0.9, False)], 0) is None
     # A miss before the hit costs it: precision is 1/2 at recall 1. Of equal probabilities none is before the other.
