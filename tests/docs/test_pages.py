@@ -112,11 +112,13 @@ def test_commands_parse(page: Path) -> None:
 
 
 @by_name
-def test_tools_exist(page: Path) -> None:
+def test_tools_exist_and_take_the_options_that_are_shown(page: Path) -> None:
     if page.name.lower() == "changelog.md":  # it tells of what was, under the names of then
         return
-    for name in re.findall(r"python3? -m (tools(?:\.[a-z]\w*)+)", text_of(page)):
-        assert (ROOT / f"{name.replace('.', '/')}.py").is_file(), name
+    for name, words in re.findall(r"python3? -m (tools(?:\.[a-z]\w*)+)([^`\n]*)", text_of(page)):
+        source = (ROOT / f"{name.replace('.', '/')}.py").read_text(encoding="utf-8")
+        for option in re.findall(r"--[a-z-]+", words):
+            assert f'"{option}"' in source, f"{name} {option}"
     for name in re.findall(r"`((?:tools|config|systemd|models|flockd|tests)/[\w/]+\.\w+)`", prose_of(page)):
         assert (ROOT / name).is_file(), name
 
