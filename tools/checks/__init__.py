@@ -1,1 +1,1 @@
-"""Does it survive: faults, fuzzing, mutants, PX4, devices."""
+"""Checks by hand and in CI: breakages, mutants, PX4, devices, long runs."""

@@ -36,9 +36,9 @@ from tools.checks.mutants import FILES, ROOT, SAFETY, Mutant, mutants_of, sample
 
 LIST = Path(__file__).with_suffix(".yaml")
 WALL_LIMIT_S = 180
-"""For a breakage that never ends; many times what its tests take."""
+"""Limit for a breakage that never ends; its tests take much less."""
 LOADED = ("numpy", "scipy.optimize", "scipy.spatial", "cv2", "pydantic", "yaml", "hypothesis", "onnxruntime", "numba")
-"""What does not change is loaded before forking."""
+"""Unchanged libraries, loaded before forking."""
 
 
 class StaleError(Exception):
@@ -58,7 +58,7 @@ class Breakage:
 
 
 def main() -> int:
-    """Tries them; the exit code."""
+    """Try the breakages; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", metavar="WORD", default="", help="those whose name or file contains it")
     parser.add_argument("--mutants", metavar="N", type=int, help="N mutants of the safety layer instead; 0: all")
@@ -82,7 +82,7 @@ def main() -> int:
 
 
 def fixed(entries: Sequence[Mapping[str, Any]]) -> list[Breakage]:
-    """The listed ones. Raises StaleError with all that do not fit."""
+    """The listed breakages. Raises StaleError that names all entries that do not fit."""
     found, stale = [], []
     for entry in entries:
         try:
@@ -97,7 +97,7 @@ def fixed(entries: Sequence[Mapping[str, Any]]) -> list[Breakage]:
 
 
 def small_changes(count: int, tests: Mapping[str, Sequence[str]]) -> list[Breakage]:
-    """So many mutants of the safety layer; 0: all."""
+    """This many mutants of the safety layer; 0: all."""
     mutants: list[Mutant] = [mutant for path in FILES for mutant in mutants_of(path)]
     mutants = sample(mutants, count) if count else mutants
     return [
@@ -146,7 +146,7 @@ def _tests() -> dict[str, list[str]]:
 def report(
     tried: Sequence[Breakage], survivors: Sequence[Breakage], equivalent: Mapping[str, str], *, whole: bool
 ) -> int:
-    """Prints who survived; the exit code."""
+    """Print the survivors; return the exit code."""
     unexplained = [one for one in survivors if one.name not in equivalent]
     for one in survivors:
         print(f"{one.file}: {one.name}\n    {equivalent.get(one.name, 'SURVIVED')}")
@@ -187,7 +187,7 @@ def prepare(folders: Sequence[Path], tests: Sequence[str]) -> None:
 
 
 def surviving(breakages: Sequence[Breakage], folders: Sequence[Path]) -> Iterator[Breakage]:
-    """Those with which all of their tests pass; one at a time in each folder."""
+    """The breakages with which all of their tests pass; one at a time in each folder."""
     free, running, began_s = list(folders), dict[int, tuple[Breakage, Path]](), time.monotonic()
     for number, one in enumerate((*breakages, *[None] * len(folders))):
         if one is None or not free:
@@ -212,7 +212,7 @@ def surviving(breakages: Sequence[Breakage], folders: Sequence[Path]) -> Iterato
 
 
 def _put_back(one: Breakage, folder: Path) -> None:
-    """With its bytecode gone: the next change of the file may have the same size and second."""
+    """Restore the file and delete its bytecode: the next change may have the same size and second."""
     path = folder / one.file
     path.unlink()
     path.symlink_to(ROOT / one.file)

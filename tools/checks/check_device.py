@@ -46,11 +46,11 @@ SUITES = {"12": "bookworm", "13": "trixie"}
 BOOT_MODULES = ("virtio_pci", "virtio_blk", "ext4")
 CHECKS = Path("tools/checks/device_check")
 DRONE_FILE = "my_drone.yaml"
-"""What docs/install.md calls the file that its reader has written."""
+"""The drone's file in docs/install.md, which the reader writes."""
 FAKE_AUTOPILOT = "pymavlink>=2.4.40"
 PIP = f"pip install --quiet --no-compile --target /opt/fake-autopilot '{FAKE_AUTOPILOT}'"
 COMPILE = "import flockd.sim.autopilot.fake_autopilot"
-"""What it needs of a dozen MAVLink dialects, and no more."""
+"""Compiles only the needed one of a dozen MAVLink dialects."""
 ARCH = "amd64"
 SYSTEM_PATH = "/usr/sbin:/usr/bin:/sbin:/bin"
 IMAGE_MB, MEMORY_MB = 4096, 2048
@@ -83,7 +83,7 @@ class UnavailableError(Exception):
 
 
 def main() -> int:
-    """Builds, boots, listens, and prints."""
+    """Build the machine, boot it, and print its findings."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cache", type=Path, metavar="DIR", help="keep the machine's files here, and use those there")
     parser.add_argument("--debian", choices=tuple(SUITES), default="12", help="what boots; default: %(default)s")
@@ -123,7 +123,7 @@ def check(folder: Path, debian: str) -> int:
 
 
 def documented_lines() -> tuple[str, str]:
-    """What docs/install.md says to install flockd as a service, and to start it."""
+    """The lines of docs/install.md that install flockd as a service, and those that start it."""
     page = (ROOT / "docs" / "install.md").read_text(encoding="utf-8")
     install, start = re.findall(r"```sh\n(.*?)```", page.partition("## Install it as a service")[2], re.DOTALL)[:2]
     return install, start
@@ -212,12 +212,12 @@ def _empty(system: Path) -> None:
 
 
 def _inside(system: Path, lines: str) -> None:
-    """In a clean environment: this computer's settings for pip are not the machine's."""
+    """Run lines of a shell in the system, without this computer's environment and settings for pip."""
     _command("chroot", str(system), "env", "-i", f"PATH={SYSTEM_PATH}", "HOME=/root", "bash", "-ec", lines)
 
 
 def _run(folder: Path, image: Path, shared: Path) -> Iterator[dict[str, Any]]:
-    """Boots, and gives what the machine writes, line by line; one that ends without its last word has failed."""
+    """Boot the machine and yield the lines that it writes; if it ends without the last one, a failed check."""
     boot, findings, console = folder / "system/boot", _fresh(folder / "findings"), folder / "console.log"
     _note("booting")
     command = [
@@ -253,7 +253,7 @@ def _run(folder: Path, image: Path, shared: Path) -> Iterator[dict[str, Any]]:
 
 
 def _fresh(folder: Path) -> Path:
-    """An empty folder in the place of what is there."""
+    """Make an empty folder in place of the old one."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
     return folder
@@ -269,7 +269,7 @@ def _command(*command: str) -> None:
 
 
 def _note(what: str) -> None:
-    """For whoever waits."""
+    """Print progress, with the time."""
     print(f"[{time.strftime('%H:%M:%S')}] {what}", file=sys.stderr, flush=True)
 
 

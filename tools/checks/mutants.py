@@ -35,12 +35,12 @@ class Mutant:
 
     @property
     def name(self) -> str:
-        """By which `breakages.yaml` knows it; without the line number, which moves."""
+        """Its name in `breakages.yaml`; without the line number, which moves."""
         return f"{self.file} {self.place}: {self.changed}"
 
 
 def sample(mutants: Sequence[Mutant], count: int, seed: str | None = None) -> list[Mutant]:
-    """So many of them, or all where there are no more, in their own order; `seed`: of the sources."""
+    """A sample of `count` mutants, or all if there are fewer, in order; `seed`: by default from the sources."""
     seed = seed or hashlib.sha256(b"".join(path.read_bytes() for path in FILES)).hexdigest()[:8]
     chosen = random.Random(seed).sample(range(len(mutants)), min(count, len(mutants)))
     return [mutants[index] for index in sorted(chosen)]
@@ -145,7 +145,7 @@ def _enums() -> dict[str, list[str]]:
 
 
 def _code(node: ast.AST) -> Iterator[ast.AST]:
-    """All nodes of a tree that are run for what they do: no annotations, no texts, no imports."""
+    """All nodes of a tree that have an effect when run: no annotations, texts or imports."""
     if isinstance(node, ast.JoinedStr | ast.Import | ast.ImportFrom):
         return
     yield node

@@ -44,13 +44,13 @@ from flockd.sim.vehicles.vehicles import REFERENCE_DEG
 _RUN = "from flockd.cli import program; program()"
 SET_ORIGIN_S = 10
 SETTLED_S = 5.0
-"""From then on the velocity counts: the drones begin at a standstill, and turn at corners."""
+"""The velocity counts from then on: the drones begin at a standstill."""
 MOST_OFF_M_S = 0.15
 CLOSEST_M, HEIGHT_M = 1.0, 0.7
 NEAR_M, FOLLOWS_M = 2.0, 10.0
 """How near to a goal the flock's middle has to come, or the drone flown by hand; and all drones, to the last one."""
 APART_M = 40.0
-"""Between the drones of small pictures: these show none of the others, whose size in them is a pixel."""
+"""Distance between drones with small pictures: at it another drone is a pixel wide and is not detected."""
 _LENS = {"fx": 64.0, "fy": 64.0, "cx": 64.0, "cy": 48.0}
 _RIG = {
     "cameras": [
@@ -82,7 +82,7 @@ class Flight:
     origin_up_m: float = 0.0
     """After ten seconds PX4's origin is set this much higher, as a ground station may."""
     ends_with: str = ""
-    """What is said when the drone leaves offboard before the end; empty: it does not."""
+    """Part of the reason with which the drone has to leave offboard; empty: it has to stay."""
 
 
 FLIGHTS = (
@@ -119,7 +119,7 @@ class Row:
     truly_off_m_s: float
     """The same of the true velocity; PX4's simulated estimate wanders by 0.15 m/s."""
     order: float
-    """Of the last 20 s."""
+    """Order of the last 20 s."""
     closest_m: float | None
     longest_step_s: float
     modes: str
@@ -129,7 +129,7 @@ class Row:
     most_off_m_s: float | None
     ends_with: str = ""
     height_off_m: float = 0.0
-    """The most by which a drone's height strayed from its first."""
+    """Largest difference between a drone's height and its first one."""
     goals: str = ""
     """When each goal was reached; of a mission that has any."""
 

@@ -1,4 +1,4 @@
-"""Write what is expected of the four recorded flights that the fast tests replay again: after new networks, say.
+"""Write the expected outputs of the four recorded flights that the fast tests replay, as after a change of networks.
 
     python -m tools.checks.references
 

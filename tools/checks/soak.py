@@ -1,4 +1,4 @@
-"""Run a whole daemon for long and see what grows: a real `flockd run` flies a circle with a fake autopilot.
+"""Run a daemon for hours and measure what grows: a real `flockd run` flies a circle with a fake autopilot.
 
 python -m tools.checks.soak --minutes 60
 
@@ -33,7 +33,7 @@ ALLOWED = {"memory, MB": 0.03, "own memory, MB": 0.03, "descriptors": 0.02, "thr
 
 
 def slope_of(name: str, values: Sequence[float]) -> dict[str, float]:
-    """How a quantity went, by samples evenly spread over a run, at least 40.
+    """Growth of a quantity, from at least 40 samples at equal intervals.
 
     `warm_up`: growth in the first tenth, from its first samples to its last; `first`, `last`: means of the second and
     of the last tenth; `slope` over the run without its first tenth, in the quantity's unit, and the ends `low` and

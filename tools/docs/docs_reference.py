@@ -134,7 +134,7 @@ def _keys(
 def _row(
     root: Mapping[str, Any], key: str, value: Mapping[str, Any], path: str, default: str, written: dict[str, str]
 ) -> Iterator[tuple[str, str, str]]:
-    """Of one key, and of those that it holds unless they were written before."""
+    """The row of a key, and those of the keys that it holds unless they were written before."""
     inner, many = _inner(root, value)
     here = f"{path}{key}"
     if inner is None:
@@ -148,7 +148,7 @@ def _row(
 
 
 def _together(rows: Iterable[tuple[str, str, str]]) -> Iterator[tuple[str, str, str]]:
-    """Neighbouring keys with one default and one type, where there is nothing else to say of them, in one row."""
+    """The rows, with neighbouring keys of the same default and type, and without a description, in one row."""
     for (default, kind), keys in itertools.groupby(rows, lambda row: row[1:]):
         names = [name for name, _, _ in keys]
         if "." in kind:

@@ -21,7 +21,7 @@ from tools.measure.labelled import WIDTH_CLASSES
 
 BLOCK = re.compile(r"(<!-- figures: (\w+) -->\n).*?(<!-- end of figures -->)", re.DOTALL)
 AGE = re.compile(r" \d+ commits? of `flockd/flight` since\.")
-"""Which changes with every commit, so that it is as of when the page was written."""
+"""The age in commits, which is that of the time when the page was written."""
 Part = Mapping[str, Any]
 PAPERS = "the paper's five drones"
 SHORT = ("order_tail", "recall_within_10m", "false_share", "associated_error_median_m", "min_distance_after_10s_m",
@@ -40,7 +40,7 @@ ENOUGH_FOR_AN_INTERVAL = 10
 
 
 def pages() -> list[Path]:
-    """Those that may have tables."""
+    """The pages that may have tables."""
     return [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
@@ -65,7 +65,7 @@ def _origin(part: Part) -> str:
 
 
 def _cell(of: Part, figure: str) -> str:
-    """Of the flights that have it, and how many these are where some have not."""
+    """A figure's median over the flights that have it, and their number if some have not."""
     one = of["figures"].get(figure)
     if one is None:
         return "-"
@@ -179,7 +179,7 @@ def _px4(parts: Mapping[str, Part]) -> str:
 
 
 def _px4_stories(parts: Mapping[str, Part]) -> str:
-    """By how they ended; of one story with several cases these in brackets."""
+    """The stories by outcome, each with its cases in brackets."""
     told: dict[str, dict[str, list[str]]] = {}
     for story, end in parts["px4_stories"]["found"].items():
         name, _, case = story.rstrip("]").partition("[")

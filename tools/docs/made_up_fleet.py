@@ -103,7 +103,7 @@ class MadeUpDrone:
     def __init__(
         self, telemetry: ZenohTelemetry, number: int, flock: int, commands: list[str], loop: asyncio.AbstractEventLoop
     ) -> None:
-        """``flock``: how many there are in all, of which it sees the nearest."""
+        """``flock``: number of drones in all; it sees the nearest."""
         self._flock = flock
         self._telemetry, self._number, self.name = telemetry, number, f"drone{number}"
         self._requests = OperatorRequests()
@@ -187,7 +187,7 @@ class MadeUpDrone:
         self._telemetry.publish(self.name, "events", {"time_s": self._steps / 2.0, "event": sentence})
 
     def _image(self, camera: str) -> bytes | None:
-        """A picture that says whose it is."""
+        """A picture with the drone's name, as JPEG; None for an unknown camera."""
         image = np.full((240, 320, 3), (140, 110, 70), np.uint8)
         image[150:] = (60, 110, 80)
         cv2.circle(image, (90 + 10 * (self._steps % 14), 120), 14, (0, 109, 255), 1, cv2.LINE_AA)
@@ -197,7 +197,7 @@ class MadeUpDrone:
 
 
 def _obstacles(time_s: float, place: FloatArray) -> ObstacleRanges:
-    """The trees as a drone at (2,) metres sees them."""
+    """The trees as a drone at ``place`` (2,), m, sees them."""
     ranges = np.full(SECTORS, np.inf)
     for offset in TREES - place:
         far = float(np.hypot(*offset)) - TREE_M

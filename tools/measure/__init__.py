@@ -1,1 +1,1 @@
-"""How good and how fast it is."""
+"""Measurements of flights, networks and perception."""

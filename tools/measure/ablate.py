@@ -1,4 +1,4 @@
-"""Leave out each mechanism of flockd/flight that is not the paper's equation, and see what flights by sight lose.
+"""Leave out single mechanisms of flockd/flight that are not the paper's equations, and compare flights by sight.
 
 python -m tools.measure.ablate    # all of the list, ten seeds of each scenario: for many cores, or many nights
 python -m tools.measure.ablate --only passing --scenarios varied head-on --seeds 3 --seconds 15
@@ -42,7 +42,7 @@ FIGURES: dict[Figure, str] = {
 }  # fmt: skip
 """What is compared, and its column."""
 MEANS_NOTHING = {("head-on", "order_tail")}
-"""There, drones are to fly opposite ways."""
+"""Figures without a meaning: head-on, drones fly in opposite directions."""
 
 Mechanism = Mapping[str, Any]
 """`name`, `lines`, `changes` (`in`, `old`, `new`) and perhaps `note`, as in the list."""
@@ -52,7 +52,7 @@ Plan = tuple[str, int, float | None]
 
 
 def listed(only: str = "") -> list[Mechanism]:
-    """Those whose name contains the word, the largest first. Raises StaleError for one that fits no more."""
+    """Mechanisms whose name contains the word, the largest first. Raises StaleError if one does not fit the sources."""
     found = [one for one in yaml.safe_load(LIST.read_text(encoding="utf-8")) if only in one["name"]]
     for one in found:
         _changed(one, ROOT)
@@ -82,7 +82,7 @@ def copy_without(mechanism: Mechanism, folder: Path) -> None:
 
 
 def key_of(mechanism: Mechanism) -> str:
-    """Tells its flights from those of others, and of another way to leave it out."""
+    """Identifies its flights, and the way in which it was left out."""
     return f"{mechanism['name']} {hashlib.sha256(repr(mechanism['changes']).encode()).hexdigest()[:8]}"
 
 
@@ -136,7 +136,7 @@ def compared(scenario: str, as_it_is: Iterable[Line], left_out: Iterable[Line]) 
 
 
 def row_of(mechanism: Mechanism, lines: Iterable[Line]) -> dict[str, Any]:
-    """What is said of one, from flights of all."""
+    """The verdict and figures of one mechanism, from the flights of all."""
     by: dict[str, dict[str, list[Line]]] = {}
     for line in lines:
         by.setdefault(line["scenario"], {}).setdefault(line["mechanism"], []).append(line)

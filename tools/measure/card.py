@@ -62,7 +62,7 @@ ROOT = Path(__file__).resolve().parents[2]
 FIGURES_FILE = ROOT / "docs" / "figures.json"
 PERCEIVED = ROOT / "config" / "perceived" / "shipped_networks.yaml"
 SEEDS = 1_000_000
-"""Worlds of flights have seeds below this: `tools.training.worlds` keeps those of training apart."""
+"""Seeds of flights are below this; those of training worlds are above (`tools.training.worlds`)."""
 CONFIDENCE = 0.95
 FIGURES: tuple[Figure, ...] = (
     "min_distance_after_10s_m", "order_tail", "shape_deviation_tail", "convergence_time_s", "recall_within_10m",
@@ -73,7 +73,7 @@ FIGURES: tuple[Figure, ...] = (
 
 @dataclass(frozen=True)
 class Eyes:
-    """What drones know each other by."""
+    """How drones know each other."""
 
     perception: SimulatedPerception
     overrides: Overrides = field(default_factory=dict)
@@ -87,7 +87,7 @@ EYES = {
 
 
 Airframe = tuple[str, float]
-"""The file of its mesh, and metres from propeller tip to tip."""
+"""File of the mesh, and the size in metres from propeller tip to tip."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ class Scenario:
     of three flights a drone is taken over by its autopilot, which holds or lands."""
 
     def overrides(self, seed: int, turn: int, airframe: Airframe | None = None) -> Overrides:
-        """What the flight with this seed, the one with this number, flies otherwise than the file says."""
+        """Overrides of the file for the flight with this seed and number."""
         if airframe is not None:
             return {**self.overrides(seed, turn), "drone.perception.drone_size_m": airframe[1]}
         if self.troubled:
@@ -120,7 +120,7 @@ class Scenario:
 
 
 REAL_AIRFRAMES = "varied, real airframes"
-"""Flown with the meshes that are given, one after another; their size is said, as a drone's template asks for it."""
+"""Flown with the meshes of `--airframe` in turn; their size is given, as in a drone's file."""
 SCENARIOS = {
     "the paper's five drones": Scenario("paper_flight.yaml", (2, 30.0)),
     "varied": Scenario("paper_flight.yaml", (3, 20.0), varied=True),
@@ -146,16 +146,16 @@ class Flight:
 
     @property
     def key(self) -> tuple[str, str, int]:
-        """What tells it from the others of a run."""
+        """Identifies the flight in a run."""
         return self.scenario, self.eyes, self.seed
 
     @property
     def log_name(self) -> str:
-        """That of its log's file, of one by sight."""
+        """Name of the log's file, of a flight by sight."""
         return f"{self.scenario.replace(' ', '_')}-{self.seed}.npz"
 
     def models(self) -> list[DroneModel] | None:
-        """What its drones look like: the airframe in as many paints; None: as the scenario says."""
+        """The airframe, painted differently for each drone; None: as the scenario says."""
         if self.airframe is None:
             return None
         file, size_m = self.airframe
@@ -163,7 +163,7 @@ class Flight:
         return [painted(shapes[0], self.seed + k) for k in range(len(self.flown().vehicles))]
 
     def flown(self) -> ScenarioConfig:
-        """What is flown."""
+        """The scenario of the flight."""
         overrides: Overrides = {**self.overrides, "seed": self.seed, "drone.perception.threads": 1}
         if self.duration_s is not None:
             overrides = {**overrides, "duration_s": self.duration_s}
@@ -192,13 +192,13 @@ def flights_of(
 
 
 def seeds_of(commit: str, scenario: str, count: int) -> list[int]:
-    """Seeds that nobody chose."""
+    """Seeds by hashes of commit, scenario and number: nobody chose them."""
     hashes = (hashlib.sha256(f"{commit} {scenario} {k}".encode()).digest() for k in range(count))
     return [int.from_bytes(one[:8]) % SEEDS for one in hashes]
 
 
 def flown(flight: Flight, logs: Path | None = None) -> Line:
-    """Fly it on this process alone; a flight that cannot be flown has its reason. One by sight leaves its log."""
+    """Fly it in this process. `failed` has the reason if it cannot be flown. A flight by sight leaves its log."""
     begin, reason, figures = time.monotonic(), None, dict[Figure, float | None]()
     try:
         perception, models = EYES[flight.eyes].perception, flight.models()
@@ -215,7 +215,7 @@ def flown(flight: Flight, logs: Path | None = None) -> Line:
 def run(
     flights: Sequence[Flight], results: Path, workers: int, fly_one: Callable[[Flight], Line] | None = None
 ) -> list[Line]:
-    """Fly what ``results`` does not have yet, add it there, and give all lines; flights that failed are tried again."""
+    """Fly what ``results`` lacks or has as failed, append it there, and return all lines."""
     lines = {_key(line): line for line in read_lines(results) if line["failed"] is None}
     missing = [flight for flight in flights if flight.key not in lines]
     fly_one = fly_one or partial(flown, logs=results.parent)
@@ -242,7 +242,7 @@ def _each(flights: Sequence[Flight], workers: int, fly_one: Callable[[Flight], L
 
 
 def read_lines(results: Path) -> list[Line]:
-    """The flights of a file of results; a last line that was cut short is left out."""
+    """The flights of a file of results, without an incomplete last line."""
     if not results.is_file():
         return []
     whole, _, _ = results.read_text(encoding="utf-8").rpartition("\n")
@@ -364,7 +364,7 @@ def _flockd(*words: str) -> str:
 
 
 def _output(*words: str) -> str:
-    """What a Python program prints, which may say with exit code 1 that a bar is missed."""
+    """The output of a Python program; its exit code may be 1."""
     ended = subprocess.run([sys.executable, *words], cwd=ROOT, stdout=subprocess.PIPE, text=True, check=False)
     if ended.returncode not in (0, 1):
         raise SystemExit(f"{' '.join(words)} ended with exit code {ended.returncode}")
@@ -372,7 +372,7 @@ def _output(*words: str) -> str:
 
 
 def _stories() -> dict[str, str]:
-    """What became of each story of a fault that PX4 flies: "passed", or else."""
+    """Outcome of each story of a fault with PX4: "passed", "failure", "error" or "skipped"."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "stories.xml"
         _output("-m", "pytest", "-q", "-m", "fault", "-k", "not fake", "tests/sitl", f"--junitxml={file}")
@@ -398,7 +398,7 @@ def git(root: Path, *words: str) -> str:
 
 
 def _part(part: str, commit: str, arguments: argparse.Namespace, known: dict[str, Any]) -> dict[str, Any]:
-    """Measure one part; of `known`, what was measured of it before, the scenarios that are not flown stay."""
+    """Measure one part. `known`: its earlier measurement, of which the scenarios that are not flown stay."""
     quick, workers, results = arguments.quick, arguments.workers, arguments.results / commit[:12]
     size = "quick" if quick else "whole"
     found: Any = None

@@ -1,4 +1,4 @@
-"""Measure distance networks on crops of drones that none of them has learnt from: one table.
+"""Measure distance networks on crops of unseen drones, and print one table.
 
     python -m tools.training.render_drone_crops CROPS --held-out --worlds 8    # --mesh for a drone of your own
     python -m tools.measure.evaluate_crops CROPS models/distance_int8.yaml MINE/distance_int8.yaml
@@ -39,7 +39,7 @@ def held_out(folder: Path) -> tuple[dict[str, Array], Array]:
 
 
 def measured(manifest: Path, crops: dict[str, Array], none: Array) -> dict[str, str]:
-    """Figures of a network by what they are; relative errors of range are of one crop, without the cascade's mean."""
+    """A network's figures by name; relative errors of range are of one crop, without the cascade's mean."""
     model = OnnxModel(manifest, threads=1)
     out, no = _columns(model, crops["picture"]), _columns(model, none)
     log_range, range_m = crops["target"][:, 0], crops["range_m"]

@@ -32,7 +32,7 @@ from tools.training.worlds import outline_of
 Array = NDArray[Any]
 SIZES_M = [drone_model(family, 0).size_m for family in range(FAMILIES)]
 MIN_PIXELS = 6
-"""Drones of which less is to be seen do not count, neither as found nor as missed."""
+"""Drones with fewer visible pixels do not count, neither as found nor as missed."""
 MASK_WITHIN_M = 10.0
 HEIGHT_SIGMA_M = 0.1
 """Standard deviation of the height above ground that an autopilot gives, by its barometer."""
@@ -121,7 +121,7 @@ def _distances(found: Findings, note: str) -> Iterator[Row]:
 
 @dataclass(frozen=True)
 class Drone:
-    """One drone in one image, and what was made of it."""
+    """One drone in one image, and its detection."""
 
     range_m: float
     width_px: float
@@ -130,11 +130,11 @@ class Drone:
     error: float
     """Relative error of its range; 0 where it was not found."""
     sigma: float
-    """What was said of that error's standard deviation."""
+    """The detection's relative standard deviation of range."""
 
 
 class Findings:
-    """Everything that is gathered over all pairs."""
+    """Counts and errors over all pairs."""
 
     def __init__(self) -> None:
         self.images = 0
@@ -211,7 +211,7 @@ def compare_drones(
     ids: Array,
     found: Findings,
 ) -> None:
-    """Note every drone of a pair's first image: a detection is a drone's if it lies in its direction, at any range."""
+    """Count every drone of a pair's first image: a detection is a drone's if it lies in its direction, at any range."""
     found.images += 1
     seen = np.flatnonzero(pairs["drone_pixels"][index, 0] >= MIN_PIXELS)
     places = [R_BODY_CAMERA @ np.asarray(pairs["drone_centre"][index, 0, drone], np.float64) for drone in seen]
@@ -251,7 +251,7 @@ def _angle(a: Array, b: Array) -> float:
 
 
 def _hidden_share(pairs: PairSet, index: int, drone: int, depth: Array, ids: Array) -> float:
-    """How much of the drone's outline, as if a thread ran around it, something nearer hides; what is cut off apart."""
+    """Share of the drone's convex outline in the image that something nearer hides."""
     family = int(pairs["drone_family"][index, drone])
     centre = np.asarray(pairs["drone_centre"][index, 0, drone], np.float64)
     corners = drone_model(family, 0).vertices @ np.asarray(pairs["drone_rotation"][index, 0, drone], np.float64).T

@@ -1,4 +1,4 @@
-"""How well `flockd detect` finds the drones of labelled pictures, and how often it takes something else for one.
+"""Measure how well `flockd detect` finds the drones of labelled pictures, and its false detections.
 
 flockd detect FOLDER --fov 90 --json > found.json
 python -m tools.measure.labelled found.json FOLDER/labels.json     # boxes in COCO's format, of the category `drone`
@@ -19,7 +19,7 @@ from flockd.ground.datasets.image_files import DatasetError, read_image
 Box = tuple[float, float, float, float]
 """Left, top, right, bottom in pixels."""
 Fit = Callable[[Box, Box], float]
-"""How well a detection's box fits a drone's, the more the better; below 0: not at all."""
+"""How well a detection's box fits a drone's: more is better; below 0: no match."""
 
 WIDTHS_PX = (0, 6, 12, 30, 80)
 """Where the classes of box width begin; the last one is open."""
@@ -27,7 +27,7 @@ WIDTH_CLASSES = tuple(f"{a}-{b}" for a, b in zip(WIDTHS_PX, [*map(str, WIDTHS_PX
 
 
 def read_labels(path: Path) -> dict[Path, list[Box]]:
-    """The drones of each picture, by COCO's boxes of the category `drone`, in whatever letters.
+    """The drones of each picture: COCO's boxes of the category `drone`, upper or lower case.
 
     Raises SystemExit for boxes that cannot be of these pictures.
     """
@@ -54,7 +54,7 @@ def read_labels(path: Path) -> dict[Path, list[Box]]:
 
 
 def _size(file: Path) -> tuple[float, float]:
-    """Width and height, without end where the picture is not here to be asked. Raises SystemExit for a damaged one."""
+    """Width and height in pixels, infinite without the picture's file. Raises SystemExit for a damaged one."""
     if not file.exists():
         return np.inf, np.inf
     try:
@@ -65,9 +65,9 @@ def _size(file: Path) -> tuple[float, float]:
 
 
 def scored(pictures: Sequence[dict[str, Any]], labels: dict[Path, list[Box]]) -> dict[str, Any]:
-    """What the labelled ones of ``pictures``, as `flockd detect --json` tells them, come to.
+    """Score the labelled ones of ``pictures``, which are in the form of `flockd detect --json`.
 
-    By the box's width the ``boxes`` and those ``found``, in which a detection's middle lies; ``ap50``, the average
+    By box width the number of ``boxes`` and of those ``found``, with a detection's middle inside; ``ap50``, the average
     precision at an intersection over union of 0.5; ``measured`` pictures; ``false``: detections that found no box.
     """
     counts = {name: {"boxes": 0, "found": 0} for name in WIDTH_CLASSES}
@@ -95,7 +95,7 @@ def scored(pictures: Sequence[dict[str, Any]], labels: dict[Path, list[Box]]) ->
 
 
 def match(detections: Sequence[Box], boxes: Sequence[Box], fit: Fit) -> list[int | None]:
-    """The number of the box that each detection finds, the most probable first: of those left the one it fits best."""
+    """For each detection, the most probable first, the number of the remaining box that it fits best, or None."""
     left, found = set(range(len(boxes))), list[int | None]()
     for one in detections:
         best = max(left, key=lambda number: fit(one, boxes[number]), default=None)
@@ -108,7 +108,7 @@ def match(detections: Sequence[Box], boxes: Sequence[Box], fit: Fit) -> list[int
 
 
 def middle_inside(one: Box, box: Box) -> float:
-    """The nearer the middles, the better, if the detection's lies in the box."""
+    """The nearer the middles, the better; -1 if the detection's middle is outside the box."""
     u, v = (one[0] + one[2]) / 2, (one[1] + one[3]) / 2
     if not (box[0] <= u <= box[2] and box[1] <= v <= box[3]):
         return -1.0
@@ -116,7 +116,7 @@ def middle_inside(one: Box, box: Box) -> float:
 
 
 def half_overlap(one: Box, box: Box) -> float:
-    """Intersection over union, if it is a half or more."""
+    """Intersection over union; -1 if it is below a half."""
     width, height = min(one[2], box[2]) - max(one[0], box[0]), min(one[3], box[3]) - max(one[1], box[1])
     both = max(width, 0.0) * max(height, 0.0)
     area, other = ((of[2] - of[0]) * (of[3] - of[1]) for of in (one, box))

@@ -1,4 +1,4 @@
-"""How drones err in what they perceive of each other, measured in flights by sight of which the truth is known.
+"""Errors of what drones perceive of each other, measured in flights by sight with known truth.
 
 `tools.measure.card --parts errors` writes it to config/perceived/shipped_networks.yaml. What is there as `detections`
 is the default of a scenario's section of that name, so that flights on made-up detections err as those by sight did:
@@ -42,15 +42,15 @@ from flockd.sim.scenario import DetectionsConfig, ScenarioConfig, load_scenario
 
 EDGES_M = (0.0, 2.0, 3.0, 4.0, 5.0, 7.0, 10.0, 14.0, 20.0)
 NEAR_M = 10.0
-"""Within it neighbours count for `detections`, as for the recall that the card shows; misses are told farther too."""
+"""Neighbours within it count for `detections`, as for the card's recall; misses are listed farther too."""
 LEAST_SAMPLES = 30
-"""Of fewer, at a distance, misses are not believed."""
+"""Least samples at a distance for its share of misses."""
 SETTLED_S = 3.0
-"""Tracks are not yet confirmed before, in a flight and of one who comes near."""
+"""Tracks are confirmed this late after a flight's begin, and after a drone has come near."""
 SIGMAS_OF_P95 = 1.96
 """95 % of normal errors are nearer than so many standard deviations."""
 REAL = "real"
-"""The family of airframes of which no network learnt ranges."""
+"""Family of the airframes whose ranges no network has learnt."""
 
 
 class Samples(NamedTuple):
@@ -78,7 +78,7 @@ class Samples(NamedTuple):
 
     @property
     def settled(self) -> BoolArray:
-        """Which drones are near and have been for `SETTLED_S`, or have been known."""
+        """Which drones are near, and have been near for `SETTLED_S` or been tracked before (S, N, N)."""
         near, known = self.distance_m < NEAR_M, np.maximum.accumulate(np.isfinite(self.log_range), axis=0)
         steps = round(SETTLED_S / self.step_s)
         begun = np.concatenate([np.repeat(near[:1], steps, axis=0), near])
@@ -87,12 +87,12 @@ class Samples(NamedTuple):
 
     @property
     def weight(self) -> float:
-        """Of a sample, so that each flight counts alike."""
+        """Weight of a sample, so that each flight counts the same."""
         return 1.0 / max(int(np.isfinite(self.distance_m).sum()), 1)
 
 
 def samples_of(log: FlightLog, scenario: ScenarioConfig) -> Samples:
-    """Of a flight by sight of this scenario, with known truth. Raises ValueError for another."""
+    """The samples of a flight by sight of this scenario, with known truth. Raises ValueError for another flight."""
     if not (log.has_truth and log.metadata.by_sight):
         raise ValueError(f"{log.metadata.scenario}: not a flight by sight with known truth")
     rig, drones = build_rig(scenario.drone.rig), np.arange(log.position.shape[1])
@@ -122,7 +122,7 @@ def samples_of(log: FlightLog, scenario: ScenarioConfig) -> Samples:
 
 
 def _beside_heading(turn: FloatArray) -> FloatArray:
-    """(S, N, N) of directions that all of a drone's in a step are turned by alike; NaN in, NaN out."""
+    """Bearing errors (S, N, N) without the part that all neighbours of a drone in a step share; NaN in, NaN out."""
     turn = (turn + np.pi) % (2 * np.pi) - np.pi
     seen = np.isfinite(turn).sum(axis=2, keepdims=True)
     mean = np.nansum(turn, axis=2, keepdims=True) / np.maximum(seen, 1)
@@ -148,7 +148,7 @@ def fit(samples: Mapping[str, Samples], families: Mapping[str, int | str]) -> di
 
 
 def _detections(flights: Sequence[Samples], by_distance: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """What is believed of made-up detections after these flights."""
+    """The parameters of simulated detections, by these flights."""
     near, step_s = _errors(flights, 0.0, NEAR_M), flights[0].step_s
     missed = [np.where(one.settled, one.missed, np.nan) for one in flights]
     share = float(np.mean([np.nanmean(one) for one in missed]))
@@ -173,7 +173,7 @@ def _by_distance(flights: Sequence[Samples]) -> list[dict[str, Any]]:
 
 
 def _errors(flights: Sequence[Samples], from_m: float, to_m: float) -> dict[str, Any]:
-    """Of drones that are so far away."""
+    """Errors of drones at these distances, m."""
     chosen = [(one.distance_m >= from_m) & (one.distance_m < to_m) for one in flights]
     missed, *errors = (
         np.concatenate([getattr(one, name)[c] for one, c in zip(flights, chosen, strict=True)])
@@ -200,7 +200,7 @@ def _quantile(values: FloatArray, share: float, weights: FloatArray) -> float:
 
 
 def _lasts_s(series: Sequence[FloatArray], flights: Sequence[Samples]) -> float:
-    """Time constant of first-order Gauss-Markov errors with the same correlation from step to step; NaN is left out."""
+    """Time constant, s, of first-order Gauss-Markov errors with the same correlation between steps; ignores NaN."""
     pairs = np.concatenate([
         math.sqrt(of.weight) * np.stack([one[:-1], one[1:]])[:, np.isfinite(one[:-1] + one[1:])]
         for one, of in zip(series, flights, strict=True)
@@ -210,7 +210,7 @@ def _lasts_s(series: Sequence[FloatArray], flights: Sequence[Samples]) -> float:
 
 
 def missed_at(by_distance: Sequence[dict[str, Any]], lasts_s: float) -> list[list[float]]:
-    """Distances, m, each with the share of detections that are missed there; the last is how far it was measured."""
+    """Distances, m, each with the share of missed detections; the last is the largest measured distance."""
     enough = [one for one in by_distance if one["samples"] >= LEAST_SAMPLES]
     shares = detections_missed([one["missed"] for one in enough], lasts_s)
     middles = [(one["from_m"] + one["to_m"]) / 2 for one in enough]
@@ -225,7 +225,7 @@ def detections_missed(of_tracks: Sequence[float], lasts_s: float) -> list[float]
 
 
 def _tracks_missed(share: float, lasts_s: float, steps: int = 600) -> float:
-    """How often a tracker has nobody, of eight drones that hover around its own."""
+    """The share of untracked drones, of eight that hover around the own one."""
     scenario = load_scenario(data_path("config") / "encounter.yaml")
     scenario = scenario.model_copy(update={"vehicles": scenario.vehicles[:1] * 9})
     errors = DetectionsConfig(missed=share, missed_time_s=lasts_s, false_at_once=0.0)

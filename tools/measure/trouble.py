@@ -1,4 +1,4 @@
-"""Five drones that fly north at 2 m from each other, and what happens to one of them."""
+"""Five drones fly north, 2 m apart, and one of them gets into trouble."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ TROUBLES: dict[str, Callable[[int, float], Overrides]] = {
     "right camera lost": _blind("right"),
     "short steps": lambda one, time_s: {"drone.step_s": 0.2},
 }
-"""By what happens: what is flown otherwise, of the drone with this number, from 1, at this time."""
+"""By trouble: overrides of the scenario, given the drone's number (from 1) and the time, s."""
 
 
 def trouble(seed: int, turn: int) -> Overrides:
@@ -50,7 +50,7 @@ def trouble(seed: int, turn: int) -> Overrides:
 
 
 def _vehicle(k: int, speed_m_s: float) -> dict[str, Any]:
-    """One of a pentagon."""
+    """Vehicle k of a pentagon."""
     radius_m, angle = _SIDE_M / (2 * math.sin(math.pi / _DRONES)), k * math.tau / _DRONES
     return {
         "position_m": (radius_m * math.cos(angle), radius_m * math.sin(angle), -4.5),
@@ -59,7 +59,7 @@ def _vehicle(k: int, speed_m_s: float) -> dict[str, Any]:
 
 
 def _turns(position_m: tuple[float, float, float], speed_m_s: float, time_s: float) -> dict[str, Any]:
-    """Along with the others, and then away to its own side."""
+    """A mission along with the others, and then away to its own side."""
     north_m = position_m[0] + speed_m_s * time_s
     ways = [(north_m, position_m[1]), (north_m, position_m[1] + math.copysign(20.0, position_m[1]))]
     return {

@@ -41,7 +41,7 @@ class Suite(NamedTuple):
     name: str
     mirror: str
     script: str
-    """Of debootstrap: one older than a suite lacks its name, and all of a distribution have the same."""
+    """debootstrap's script: an older debootstrap lacks the suite's name, and all suites of a distribution share one."""
     keyring: str
 
 
@@ -52,7 +52,7 @@ SUITES = {
     "ubuntu24.04": Suite("noble", UBUNTU_PORTS, "gutsy", UBUNTUS),
 }
 BINFMT = Path("/proc/sys/fs/binfmt_misc")
-"""What the kernel starts by another program."""
+"""The formats that the kernel starts by another program."""
 INSTALL = "apt-get install --quiet --quiet --yes --no-install-recommends"
 SIMULATOR = "/usr/lib/flockd/lib/python*/site-packages/flockd/_data/config/simulator.yaml"
 NETWORKS = ("flow_int8", "neighbours_int8", "detector", "distance_int8", "verification_int8")
@@ -74,7 +74,7 @@ STEPS = (
 
 
 def main() -> int:
-    """Says each step; the first that fails ends it."""
+    """Run each step; the first failure ends the check."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--system", required=True, choices=tuple(SUITES))
     parser.add_argument("--arch", default="arm64", choices=tuple(deb.MACHINES), help="default: %(default)s")
@@ -99,7 +99,7 @@ def main() -> int:
 
 
 def _missing(arch: str, suite: Suite) -> str | None:
-    """What this computer lacks, and what to do; None: nothing."""
+    """What this computer lacks, and the remedy; None: nothing."""
     machine = deb.MACHINES[arch]
     if os.geteuid() != 0:
         return "root is needed to make another system; run it with sudo"

@@ -1,4 +1,4 @@
-"""Builds what a stranger installs, and flies it: sdist and wheel, the wheel alone in an empty environment.
+"""Build sdist and wheel, install the wheel alone in an empty environment, and fly it.
 
 python -m tools.release.check_wheel --out dist
 
@@ -22,7 +22,7 @@ from flockd import __version__
 from tools.release.wheels import ROOT
 
 PICTURE = ROOT / "tests/ground/pictures/rendered/4_m_4.jpg"
-"""One drone."""
+"""A picture of one drone."""
 
 
 STEPS = (
@@ -41,7 +41,7 @@ STEPS = (
 
 
 def main() -> int:
-    """Says each step; the first that fails ends it."""
+    """Run each step; the first failure ends the check."""
     parser = argparse.ArgumentParser(description="Builds sdist and wheel, checks them, and flies the wheel.")
     parser.add_argument("--out", type=Path, default=Path("dist"), help="for both (default: dist)")
     args = parser.parse_args()

@@ -1,4 +1,4 @@
-"""Build a Debian package that brings flockd with everything it flies with.
+"""Build a Debian package of flockd with everything that it needs to fly.
 
 python -m tools.release.deb --arch arm64                          # dist/flockd_..._arm64.deb, for Debian 12
 python -m tools.release.deb --arch amd64 --system ubuntu24.04 --out packages
@@ -35,7 +35,7 @@ HOME = "usr/lib/flockd"
 """The virtual environment."""
 UNIT_FOLDER = "usr/lib/systemd/system"
 HAND_MADE, PACKAGED = "/opt/flockd/bin/flockd", "/usr/bin/flockd"
-"""What the units of systemd/ start, and what those of the package do."""
+"""The command that the units of systemd/ start, and the package's."""
 COMMAND = f"""\
 #!/{HOME}/bin/python
 from flockd.cli import program
@@ -179,7 +179,7 @@ def _control(tree: Path, values: Mapping[str, str]) -> None:
 
 
 def _set_modes(tree: Path) -> None:
-    """Whatever the umask here and the modes in the wheels are."""
+    """Set the modes of all files, independent of the umask and of the wheels."""
     programs = {tree / HOME / "bin/flockd", *(tree / "DEBIAN" / name for name in SCRIPTS)}
     for path in [tree, *tree.rglob("*")]:
         if not path.is_symlink():

@@ -1,4 +1,4 @@
-"""What a real, cheap camera makes of a sharp picture, at the camera's own resolution.
+"""The effects of a real, cheap camera on a sharp picture, at the camera's own resolution.
 
 A drone is 6 to 60 pixels wide there, so a blur of a pixel or two of the second stage's enlarged crop is far too little.
 The crop is shrunk to the size that the camera saw it in, passes the steps of a camera in their order, and is enlarged
@@ -53,7 +53,7 @@ class CameraEffects:
 
 
 def drawn_effects(scale: float, rng: np.random.Generator) -> CameraEffects:
-    """Any camera that flies or films; a quarter have almost nothing wrong with them.
+    """A random camera; a quarter have almost no faults.
 
     Width of edges (contrast over the steepest gradient, camera pixels, 10 / 50 / 90 % of the drones of 20-30 px).
     Skydrones' training clips 1.8 / 2.1 / 2.2, renderings merely shrunk 1.5 / 2.0 / 2.7, through these cameras 1.7 / 2.4
@@ -80,7 +80,7 @@ def drawn_effects(scale: float, rng: np.random.Generator) -> CameraEffects:
 
 
 def as_filmed(images: Sequence[Image], rng: np.random.Generator) -> list[Image]:
-    """``UNTOUCHED`` of the time as they are; else as one camera shows them (h, w, 3), each smeared in its own way."""
+    """The images (h, w, 3), unchanged with probability ``UNTOUCHED``; else as one camera shows them, each blurred."""
     if rng.random() < UNTOUCHED:
         return list(images)
     effects = drawn_effects(float(np.exp(rng.uniform(math.log(0.5), 0.0))), rng)
@@ -90,7 +90,7 @@ def as_filmed(images: Sequence[Image], rng: np.random.Generator) -> list[Image]:
 
 
 def through_camera(sharp: Image, effects: CameraEffects, rng: np.random.Generator) -> Image:
-    """The picture (h, w, 3), RGB, as that camera shows it, at its old size."""
+    """The picture (h, w, 3), RGB, as that camera shows it, at the same size."""
     height, width = sharp.shape[:2]
     size = (max(_LEAST_SIDE_PX, round(width * effects.scale)), max(_LEAST_SIDE_PX, round(height * effects.scale)))
     small: Image = _resized(sharp, size)
@@ -120,7 +120,7 @@ def through_camera(sharp: Image, effects: CameraEffects, rng: np.random.Generato
 
 
 def smear_kernel(length_px: float, angle: float) -> NDArray[np.float32]:
-    """Kernel of a point that moves evenly along a line; sums to 1."""
+    """Blur kernel of a uniform motion along a line; sums to 1."""
     reach = math.ceil(length_px / 2) + 1
     kernel = np.zeros((2 * reach + 1, 2 * reach + 1), np.float32)
     for share in (np.arange(16 * reach) + 0.5) / (16 * reach) - 0.5:
@@ -145,7 +145,7 @@ def demosaiced(image: Image) -> Image:
 
 
 def _compressed(image: Image, quality: int, rng: np.random.Generator) -> Image:
-    """With the blocks of the compression anywhere, as in a larger image."""
+    """The image after JPEG, whose blocks begin anywhere, as in a part of a larger image."""
     left, top = int(rng.integers(8)), int(rng.integers(8))
     wide = cv2.copyMakeBorder(image, top, 8, left, 8, cv2.BORDER_REFLECT_101)
     packed = jpeg(np.asarray(wide, np.uint8), quality)

@@ -1,4 +1,4 @@
-"""Rendered pairs of images with their truth, on disk as plain arrays that open without being read."""
+"""Rendered pairs of images with their truth, on disk as memory-mapped arrays."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ HEIGHT, WIDTH = 640, 480
 MAX_DRONES = 6
 FOCAL_PX = 222.0
 MAX_DEPTH_M = 80.0
-"""What the depth output says of the sky."""
+"""Depth of the sky in the network's output."""
 MAX_FAMILIES = 16
-"""Room for this many drone shapes in the distance network's training hints."""
+"""Number of drone families that the distance network classifies in training."""
 R_BODY_CAMERA = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-"""Rotation of a camera that looks forward: optical RDF to body FRD."""
+"""Rotation of a camera that looks forward: camera RDF to body FRD."""
 
 ARRAYS: dict[str, tuple[tuple[int, ...], Any]] = {
     "image": ((2, HEIGHT, WIDTH, 3), np.uint8),
@@ -86,7 +86,7 @@ def create_part(folder: Path, count: int) -> dict[str, NDArray[Any]]:
 
 
 def rig_camera(focal: float) -> RigCamera:
-    """The camera that took a picture, alone, at the body's origin and looking forward."""
+    """The camera of a picture, at the body's origin, looking forward."""
     matrix = np.array([[focal, 0.0, WIDTH / 2], [0.0, focal, HEIGHT / 2], [0.0, 0.0, 1.0]])
     return RigCamera("camera", PinholeCamera(matrix, (WIDTH, HEIGHT)), RigidTransform(R_BODY_CAMERA, np.zeros(3)))
 
@@ -106,5 +106,5 @@ def ray_tangents(focal: float) -> NDArray[np.float32]:
 
 
 def note(folder: Path, **facts: object) -> None:
-    """Leave a record of how the folder was made."""
+    """Write to the folder how it was made."""
     (folder / "made.json").write_text(json.dumps(facts, indent=1))

@@ -1,4 +1,4 @@
-"""YOLOX-nano in torch, and what it learns by (Ge et al. 2021, "YOLOX: Exceeding YOLO Series in 2021").
+"""YOLOX-nano in torch, and its loss (Ge et al. 2021, "YOLOX: Exceeding YOLO Series in 2021").
 
 Depth 0.33, width 0.25, depthwise; an anchor-free detector: in each cell of three maps (strides 8, 16, 32) a box, an
 objectness, and classes. Which cells answer for which box is SimOTA (sections 2.1 and 2.2).
@@ -24,7 +24,7 @@ _BEST = 10
 """The sum of the best so many overlaps says how many cells answer for a box."""
 _BOX_WEIGHT, _OVERLAP_COST, _FAR_COST = 5.0, 3.0, 1e6
 _LEAST_TARGET = 0.75
-"""A class is learnt as at least so probable, where the box is still wrong: small boxes overlap badly for long."""
+"""Least target of a class while the box is still wrong: small boxes overlap badly for long."""
 
 
 class Unit(nn.Module):
@@ -211,7 +211,7 @@ def detection_loss(maps: Sequence[Tensor], boxes: Tensor, classes: Tensor) -> tu
 def _assigned(
     predicted: Tensor, there: Tensor, kinds: Tensor, boxes: Tensor, classes: Tensor, near: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Image, cell, which box it answers for, and their overlap; ``near`` (n, m, cells): which may answer for which."""
+    """Image, cell, its box, and their overlap, of each assignment; ``near`` (n, m, cells): the permitted ones."""
     near = near & (classes >= 0)[:, :, None]
     overlap = _overlap(predicted[:, None], boxes[:, :, None])
     score = (there.sigmoid()[..., None] * kinds.sigmoid()).sqrt().clamp(1e-6, 1 - 1e-6)

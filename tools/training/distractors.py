@@ -1,4 +1,4 @@
-"""Meshes of what flies, floats or stands up into the sky and is no drone: no two alike, drawn from a generator."""
+"""Random meshes of birds, balloons, kites, bags and masts: distractors that are no drones."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from flockd.sim.renderer.airframe import Solid
 from flockd.sim.world.mesh import Mesh
 
 _SKIN = 0
-"""All wear one of the machine textures: fine grain."""
+"""The machine texture of all of them: fine grain."""
 _DOWN = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True, eq=False)
 class Distractor(Solid):
-    """One thing's, its origin in its body; `size_m` is its longest side, a mast's without the pole."""
+    """A mesh with its origin in the body; `size_m` is the longest side, of a mast without the pole."""
 
     wing: NDArray[np.int8]
     """(n,) 1 for vertices of a right wing, -1 of a left one, else 0."""
@@ -30,7 +30,7 @@ class Distractor(Solid):
     """Half the distance between the wings' hinges."""
 
     def flapped(self, angle: float) -> Distractor:
-        """The same with its wings raised by an angle, rad; a thing without wings stays as it is."""
+        """The same with its wings raised by an angle, rad; without wings the same."""
         sideways, down = self.wing * self.vertices[:, 1] - self.shoulder_m, self.vertices[:, 2]
         outward = self.shoulder_m + sideways * math.cos(angle) + down * math.sin(angle)
         turned = np.column_stack(
@@ -160,5 +160,5 @@ def _across(x: float, half_width: float, half_height: float) -> FloatArray:
 
 
 def _paint(rng: Generator) -> FloatArray:
-    """Any colour that is sold."""
+    """A random colour."""
     return np.asarray(np.clip(rng.uniform(0.05, 0.8) * rng.uniform(0.1, 1.0, 3), 0.02, 0.8))

@@ -1,4 +1,4 @@
-"""Multirotors drawn from a seed: hundreds of shapes, so that no network learns a dozen by heart.
+"""Random multirotors: hundreds of shapes, so that networks do not overfit to a dozen.
 
 Four to eight rotors on arms in many layouts, bodies, guards, landing gear, payloads and lights, 0.15 to 1.2 m from tip
 to tip. A shape's size is its own, as of the simulator's families; only paint and propeller angles differ within it.
@@ -28,7 +28,7 @@ DRAWN_SIZE_M = 0.6
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """What one shape is drawn from; metres, body FRD."""
+    """Layout of one shape; metres, body FRD."""
 
     hubs: Array
     """(n, 3) where the arms end."""
@@ -78,7 +78,7 @@ def _scaled(model: DroneModel, factor: float) -> DroneModel:
 
 
 def _plan(rng: Generator, room: float) -> Plan:
-    """Layout and sizes; ``room``: of the propellers as a share of what there is."""
+    """Layout and sizes; ``room``: share of the space that propellers may take."""
     shares = np.array([one.share for one in _LAYOUTS])
     layout = _LAYOUTS[int(rng.choice(len(_LAYOUTS), p=shares / shares.sum()))]
     places = np.asarray(layout.places(rng), float)
@@ -295,7 +295,7 @@ def add_landing_gear(c: Airframe, hubs: Array, reach: float, body: tuple[float, 
 
 
 def add_payloads(c: Airframe, reach: float, body: tuple[float, float, float], rng: Generator) -> None:
-    """None to three of them."""
+    """Add up to three payloads."""
     chosen = rng.choice(len(_PAYLOADS), int(rng.choice([0, 1, 2, 3], p=[0.15, 0.35, 0.35, 0.15])), replace=False)
     for k in chosen:
         _PAYLOADS[int(k)](c, reach, body, rng)

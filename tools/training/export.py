@@ -41,7 +41,7 @@ ALLOWED_DIFFERENCE = 2e-3
 HALF_AT_MOST = 0.01
 """Mean difference of an output in its standard deviations, beyond which weights of 16 bits are refused."""
 _SMALL = 64
-"""Weights of fewer numbers, as a layer's offsets, keep their 32 bits."""
+"""Arrays with fewer numbers, such as biases, keep 32 bits."""
 BEGUN_WITH_SHARE = 0.35
 
 
@@ -112,7 +112,7 @@ def draw_back(net: nn.Module, start: dict[str, Tensor], share: float = BEGUN_WIT
 
 
 def halve(file: Path, feeds: Arrays) -> Arrays:
-    """Store a model's weights as 16-bit floats, which are 32-bit ones again once it is loaded; its outputs then."""
+    """Store a model's weights as 16-bit floats, which it casts to 32 bits when it runs; its outputs then."""
     model, casts = onnx.load(file), []
     for weights in model.graph.initializer:
         numbers = numpy_helper.to_array(weights)

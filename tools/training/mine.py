@@ -1,4 +1,4 @@
-"""Find what the first stage, or the detector, takes for drones though there are none: training says no to it.
+"""Find false proposals of the first stage, or of the detector: negatives for training.
 
     python -m tools.training.mine DATA --model models/neighbours_int8.yaml
 
@@ -30,7 +30,7 @@ BESIDE_PX = 25.0
 
 
 def main() -> None:
-    """Look at all that is there."""
+    """Mine every folder that is there."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path)
     parser.add_argument("--model", type=Path, required=True, help="manifest of a neighbours network or of a detector")
@@ -79,7 +79,7 @@ def proposed(
     drones: Sequence[Sequence[float]],
     planes: NDArray[np.float32] | None = None,
 ) -> list[Box]:
-    """Boxes in an RGB image (h, w, 3), sides multiples of 32, that are none of its ``drones``.
+    """Proposed boxes in an RGB image (h, w, 3), sides multiples of 32, away from its ``drones``.
 
     ``planes`` (3, h/2, w/2) of a neighbours network; by default of a camera of 90 degrees at a height unknown.
     """

@@ -20,7 +20,7 @@ from tools.training.dataset import MAX_DEPTH_M, MAX_FAMILIES
 
 Out = TypeVar("Out")
 PLANE_STEPS = torch.tensor([64.0, 64.0, 32.0])[:, None, None]
-"""Steps of the geometry's planes: in a network that runs, a step of 8-bit numbers is one over this."""
+"""Steps per unit of the geometry's planes, where they enter an 8-bit network."""
 OFFSET_SCALE_PX = 16.0
 """Centre offsets leave the network in units of this many pixels of the half-size map."""
 
@@ -32,20 +32,20 @@ def _conv(inputs: int, outputs: int, stride: int = 1, kernel: int = 3) -> nn.Seq
 
 
 def _in_full_precision(layer: Callable[[Tensor], Out], x: Tensor) -> Out:
-    """The layer on 32-bit numbers, also where training runs on 16-bit ones: metres need more than three digits."""
+    """The layer in 32 bits, also if training runs in 16: metres need more than three digits."""
     with torch.autocast(x.device.type, enabled=False):
         return layer(x.float())
 
 
 def _blocks(image: Tensor) -> Tensor:
-    """(n, h, w, 3) uint8 -> (n, 12, h / 2, w / 2) in -1..1, each block of 2 x 2 pixels in one place."""
+    """(n, h, w, 3) uint8 -> (n, 12, h / 2, w / 2) in -1..1: blocks of 2 x 2 pixels become channels."""
     n, h, w, _ = image.shape
     x = image.reshape(n, h // 2, 2, w // 2, 2, 3).permute(0, 5, 2, 4, 1, 3)
     return (x.reshape(n, 12, h // 2, w // 2).float() - 128.0) / 127.5
 
 
 def _entry(image: Tensor, *planes: Tensor) -> Tensor:
-    """What the first layer of a network that runs looks at: the image's 2 x 2 blocks in grey levels less 128, planes.
+    """Input of the first layer at inference: the image's 2 x 2 blocks in grey levels minus 128, and planes.
 
     (n, h, w, 3) uint8 -> (n, 12 + ., h / 2, w / 2). Whole numbers from 0 to 255 less 128 are 8-bit numbers as they are:
     see ``tools.training.quantise``.
@@ -57,7 +57,7 @@ def _entry(image: Tensor, *planes: Tensor) -> Tensor:
 
 
 def _on_entry(layer: nn.Sequential, entry: Tensor) -> Tensor:
-    """``layer``, trained on ``_blocks``, on what ``_entry`` gives."""
+    """The output of ``layer``, which is trained on ``_blocks``, for an input of ``_entry``."""
     convolution, norm = layer[0], layer[1]
     scale = norm.weight / torch.sqrt(norm.running_var + norm.eps)
     weight = (convolution.weight * scale[:, None, None, None]).detach()
@@ -70,7 +70,7 @@ def _on_entry(layer: nn.Sequential, entry: Tensor) -> Tensor:
 
 
 def first_layers_of(net: nn.Module, kernels: list[tuple[Tensor, Tensor]]) -> dict[str, Tensor]:
-    """The weights that ``_on_entry`` made these kernels and biases of, without their normalisation."""
+    """The trained weights from which ``_on_entry`` made these kernels and biases, without normalisation."""
     names = ["stem.0"] if isinstance(net, NeighboursNet | DistanceNet | VerificationNet) else []
     weights: dict[str, Tensor] = {}
     for name, (kernel, bias) in zip(names, kernels, strict=True):
@@ -92,7 +92,7 @@ class _Residual(nn.Module):
 
 
 class NeighboursNet(nn.Module):
-    """U-Net that begins at a quarter of the image's size; what is finer than that its channels hold.
+    """U-Net that begins at a quarter of the image's size; its channels hold the finer detail.
 
     Inputs: image (n, h, w, 3) uint8; geometry (n, 3, h/2, w/2): tangents of the pixel's ray right and down of the
     optical axis. The third plane is the inverse depth in 1/m of flat ground as attitude and height say (0: unknown or
@@ -183,7 +183,7 @@ class DistanceNet(_CropEncoder):
 
     motors = 4
     maps = 8
-    """The first are of the motors; what the others look for is learnt."""
+    """The first are the motors; the others are learnt."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -331,7 +331,7 @@ class FlowNet(nn.Module):
         self.mask = nn.Sequential(nn.Conv2d(self.hidden, 96, 3, 1, 1), nn.ReLU(True), nn.Conv2d(96, 9 * 64, 1))
 
     def forward(self, first: Tensor, second: Tensor) -> Tensor | list[Tensor]:
-        """The last flow, or in training all of them."""
+        """The last iteration's flow, or in training that of each."""
         both = torch.cat([first, second], 0).permute(0, 3, 1, 2).float() / 127.5 - 1.0
         features = self.encoder(both)
         n = first.shape[0]

@@ -1,4 +1,4 @@
-"""A drone's mesh from a file as the renderer draws it: of glTF, which says metres, colours, and what is up (+y)."""
+"""A drone's mesh from a glTF file (metres, y up, with colours), for the renderer."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def _surface(path: Path, size_m: float) -> tuple[Array, Array, Array]:
 
 
 def painted(model: DroneModel, seed: int) -> DroneModel:
-    """The same drone in another light and wear; what has no colour in its file gets one."""
+    """The same drone in another light; parts without a colour get a random one."""
     rng = np.random.default_rng([model.family, seed])
     colours = model.colours * np.exp(rng.normal(0, 0.15)) * np.exp(rng.normal(0, 0.04, 3))
     plain = np.isnan(model.colours).any(axis=1)

@@ -1,4 +1,4 @@
-"""What is trained on real pictures besides rendered ones: `detector` and `verification`.
+"""Training of `detector` and `verification`, on real pictures beside rendered ones.
 
 Positives and negatives pass through the same cameras: else a network learns that what is soft is a drone.
 """
@@ -44,14 +44,14 @@ from tools.training.tasks import Batch, Task
 SIDES_PX = {256: 24, 320: 16, 416: 9}
 """Width and height of a batch's pictures, and how many of them take about the same time."""
 MIX = {"composite": 0.40, "without": 0.22, "labelled": 0.25, "worlds": 0.13}
-"""Shares of the pictures. Half of those without a drone are the very backgrounds of composites of the same batch."""
+"""Shares of the pictures. Half of those without a drone are backgrounds of composites of the same batch."""
 
 CROP_PX = 96
 CROPS = {"rendered": 36, "composite": 30, "real drone": 12, "negative": 46}
 """Samples of a batch of `verification`."""
 KINDS = tuple(CROPS)
 WIDTHS_PX = (6.0, 240.0)
-"""How wide a drone is in the camera's image, evenly by its logarithm."""
+"""Width of a drone in the camera's image; its logarithm is uniform."""
 _CROP_SHARE = (0.45, 1.65)
 """Half of a crop around a proposal, in the pipeline's first ones: the network's own size leads there."""
 _PLACE_HALF_PX = (5.0, 300.0)
@@ -68,7 +68,7 @@ proportion: who is taught drones that cannot be seen learns to see them everywhe
 
 
 class DetectorTask(Task):
-    """Drones before everything, what flies besides them, and pictures without any."""
+    """Composites, labelled pictures, rendered worlds, and pictures without drones."""
 
     def __init__(self, data: Path) -> None:
         super().__init__(DroneDetector(), SIDES_PX[320], 5e-4)
@@ -122,7 +122,7 @@ def _sample(scene: Scene) -> Sample:
 
 
 class VerificationTask(Task):
-    """Crops of drones and of what is none: rendered, rendered before photographs, and real."""
+    """Crops with and without drones: rendered, rendered before photographs, and real."""
 
     def __init__(self, data: Path) -> None:
         super().__init__(VerificationNet(), sum(CROPS.values()), 6e-4)
@@ -248,7 +248,7 @@ def visibility(picture: NDArray[Any], hidden: NDArray[Any], scale: float) -> flo
 
 
 def _perhaps_softer(picture: Image, camera_px: float, scales: tuple[float, float], rng: Generator) -> Image:
-    """Every other one through another camera as well."""
+    """Half of the pictures pass through another camera."""
     if rng.random() < 0.5:
         return picture
     scale = max(min(1.0, camera_px) * float(rng.uniform(*scales)), _LEAST_SCALE)

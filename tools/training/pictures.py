@@ -1,4 +1,4 @@
-"""The pictures that training draws from: rendered drones before photographs, real drones, worlds, and what is none."""
+"""Pictures for training: rendered drones before photographs, real drones, rendered worlds, pictures without drones."""
 
 from __future__ import annotations
 
@@ -24,31 +24,31 @@ Image = NDArray[np.uint8]
 One = TypeVar("One")
 Boxes = NDArray[np.float32]
 Named = tuple[str, float, float, float, float]
-"""What something is, and left, top, right, bottom in pixels."""
+"""Name of an object, and left, top, right, bottom in pixels."""
 CLASSES = ("drone", "bird", "airplane", "helicopter")
 NO_BOX, NOT_JUDGED = -1, -2
-"""Classes of a box that is none, and of one where nothing is learnt of whether there is an object."""
+"""Class of an unused box, and of a box in which the objectness is not learnt."""
 PROPOSALS = "proposals.jsonl"
 MOST_BOXES = 10
 LEAST_WIDTH_PX = 5.0
-"""Of what is learnt as a drone; what is smaller is not judged."""
+"""Least width of a drone that is learnt; a smaller one is `NOT_JUDGED`."""
 LEAST_SEEN = 0.35
-"""Share of a drone's pixels that has to be seen for it to be learnt."""
+"""Share of a drone's pixels that has to be visible; else it is `NOT_JUDGED`."""
 _SOLID = 64
 """Least alpha of a pixel that belongs to a drone's box: the discs of propellers are fainter."""
 _SCALES = (0.35, 1.4)
-"""A photograph is resized by, unless it would not fill the picture then."""
+"""Factors by which a photograph is resized, unless it would not fill the picture then."""
 _IN_MEMORY = 6000
 _AIMED_SHARE = 0.6
-"""At least so many of the drones are in the middle and fill their crop: the last crop of a drone is what counts."""
+"""Least share of the drones that are in the middle and fill their crop, as in the cascade's last crop."""
 _NONE_SHARE = 0.08
-"""Share of what is drawn that is no drone, however many families there are."""
+"""Share of the samples without a drone, however many families there are."""
 _AIMED_OFF_PX, _AIMED_PX = 4.0, (60.0, 84.0)
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A picture and what is in it."""
+    """A picture and its boxes."""
 
     image: Image
     """(s, s, 3) RGB"""
@@ -95,7 +95,7 @@ def pictures_in(folder: Path) -> list[tuple[str, str, list[Named]]]:
 
 
 class _ByCategory(Generic[One]):
-    """Things, of each category as often as the root of its number says."""
+    """Draws of categories, each in proportion to the square root of its size."""
 
     def __init__(self, things: Iterable[tuple[str, One]]) -> None:
         by_category = defaultdict[str, list[One]](list)
@@ -112,14 +112,14 @@ class _ByCategory(Generic[One]):
 
 
 class Photographs:
-    """Pictures of everything without drones, of each category as often as the root of its number says."""
+    """Photographs without drones, of each category in proportion to the square root of its size."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._pictures = _ByCategory((category, (name, boxes)) for name, category, boxes in pictures_in(folder))
 
     def draw_whole(self, rng: Generator) -> tuple[Image, list[Named]]:
-        """Any of them, and what flies in it."""
+        """One of them, and the boxes of the flying objects in it."""
         name, boxes = self._pictures.draw(rng)
         return read(self._folder / name), boxes
 
@@ -129,7 +129,7 @@ class Photographs:
 
 
 class Proposals:
-    """What `tools.training.mine` found in folders of pictures, of each category as often as the root of its number."""
+    """False proposals of `tools.training.mine`, of each category in proportion to the square root of its size."""
 
     def __init__(self, folders: Sequence[Path]) -> None:
         found: list[tuple[str, tuple[Path, tuple[float, ...]]]] = []
@@ -144,7 +144,7 @@ class Proposals:
         self._found = _ByCategory(found)
 
     def draw(self, rng: Generator) -> tuple[Image, tuple[float, ...]]:
-        """The picture of one, and its box there."""
+        """The picture of a proposal, and its box."""
         path, box = self._found.draw(rng)
         return read(path), box
 
@@ -159,7 +159,7 @@ class Labelled:
 
     @property
     def drones(self) -> int:
-        """How many there are."""
+        """Number of labelled drones."""
         return len(self._drones)
 
     def draw_drone(self, rng: Generator) -> tuple[Image, tuple[float, ...]]:
@@ -168,7 +168,7 @@ class Labelled:
         return read(self._folder / name), tuple(box)
 
     def draw(self, size: int, rng: Generator) -> Scene:
-        """A part around one of the boxes."""
+        """A part of a picture, ``size`` pixels wide and high, around one of the boxes."""
         name, boxes = self._pictures[int(rng.integers(len(self._pictures)))]
         _, left, top, right, bottom = boxes[int(rng.integers(len(boxes)))]
         least = min(max(0.5, (LEAST_WIDTH_PX + 1) / max(right - left, 1.0)), 1.0)
@@ -221,14 +221,14 @@ class CropFiles:
         self._up_to = np.cumsum(probability) / probability.sum()
 
     def draw(self, rng: Generator) -> Sample:
-        """Any of them, and now and then what is none: every family as often as any other, however many crops there are
-        of it, every shape as any other, and shapes together ``worlds.SHAPES_SHARE`` of the drones."""
+        """One of them, sometimes without a drone. Families are equally frequent, however many crops they have; so are
+        shapes, and together they are ``worlds.SHAPES_SHARE`` of the drones."""
         row = int(np.searchsorted(self._up_to, rng.random(), side="right"))
         return {name: values[row] for name, values in self._samples.items()}
 
 
 def _shares_of(names: NDArray[np.int64]) -> NDArray[np.float64]:
-    """How often each family is drawn, -1 being none and those from ``MAX_FAMILIES`` on shapes; not scaled."""
+    """Frequency of each family, not scaled; -1: no drone, from ``MAX_FAMILIES`` on: shapes."""
     is_none, is_family = names == -1, (names >= 0) & (names < MAX_FAMILIES)
     shares = np.zeros(len(names))
     for which, of in ((is_family, 1 - worlds.SHAPES_SHARE), (~(is_none | is_family), worlds.SHAPES_SHARE)):
@@ -254,7 +254,7 @@ def part_of(
 ) -> Scene:
     """A resized square part of a picture, anywhere or with the pixel ``aim`` in it.
 
-    ``boxes``: name, left, top, right, bottom of each; a name that is no class of ours is not judged.
+    ``boxes``: name, left, top, right, bottom of each; one whose name is not in `CLASSES` is `NOT_JUDGED`.
     """
     height, width = image.shape[:2]
     drawn = math.exp(rng.uniform(*np.log(scales)))
@@ -281,7 +281,7 @@ def part_of(
 
 
 def with_drones(scene: Scene, cutouts: Cutouts, rng: Generator) -> Scene:
-    """One to four drones more, of any width, some near each other, cut by a border, or behind something."""
+    """The scene with one to four more drones, of any width, some near each other, cut off or partly hidden."""
     image, size = scene.image.astype(np.float32), scene.image.shape[0]
     boxes, classes = list(scene.boxes), list(scene.classes)
     near: tuple[float, float, float] | None = None
@@ -308,7 +308,7 @@ def with_drones(scene: Scene, cutouts: Cutouts, rng: Generator) -> Scene:
 
 
 def looked_at(cutout: Image, width: float, rng: Generator) -> NDArray[np.float32]:
-    """(h, w, 4) premultiplied, 0-255, of the wanted width, turned, lit and tinted as it may be."""
+    """The cut-out (h, w, 4), premultiplied, 0-255, at a width in pixels, with another rotation, light and tint."""
     if rng.random() < 0.5:
         cutout = np.ascontiguousarray(cutout[:, ::-1])
     colour: NDArray[Any] = cutout[..., :3].astype(np.float32)
@@ -332,7 +332,7 @@ def looked_at(cutout: Image, width: float, rng: Generator) -> NDArray[np.float32
 def paste(
     image: NDArray[np.float32], drone: NDArray[np.float32], middle: NDArray[np.float64], rng: Generator
 ) -> tuple[NDArray[np.float32] | None, float]:
-    """Its box in the image, and the share of it that is seen; the image (h, w, 3) is drawn into."""
+    """The drone's box in the image, and its visible share; draws into the image (h, w, 3)."""
     height, width = image.shape[:2]
     left, top = np.rint(middle - np.array([drone.shape[1], drone.shape[0]]) / 2).astype(int)
     x0, y0, x1, y1 = max(left, 0), max(top, 0), min(left + drone.shape[1], width), min(top + drone.shape[0], height)
@@ -372,7 +372,7 @@ def _covered(box: Any, by: Any) -> float:
 
 
 def filmed(scene: Scene, rng: Generator, *, is_photograph: bool) -> Scene:
-    """As a camera delivers it, left and right exchanged half of the time."""
+    """The scene as a camera shows it, mirrored half of the time."""
     (image,) = as_filmed([scene.image], rng)
     if is_photograph:
         image = through_camera(scene.image, drawn_effects(1.0, rng), rng)

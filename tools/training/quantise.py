@@ -1,4 +1,4 @@
-"""Make the 8-bit twin of a network: half the time on a CPU. The range of its numbers is learnt from rendered images.
+"""Make the 8-bit version of a network: half the time on a CPU. Rendered images calibrate its ranges.
 
 python -m tools.training.quantise models/neighbours.yaml --data DATA/training --out models
 python -m tools.training.quantise models/distance.yaml --data DATA/crops --out models
@@ -28,7 +28,7 @@ from tools.training.dataset import HEIGHT, WIDTH, ground_plane, open_pairs, ray_
 Feeds = dict[str, NDArray[Any]]
 IMAGES, COMPARED = 32, 16
 WITHOUT_HEIGHT = 0.3
-"""Share of the images whose geometry says nothing of the ground."""
+"""Share of the images without the ground in their geometry."""
 IN_8_BITS = ("Conv", "Relu", "Resize")
 KEPT = ("head", "look")
 """Layers with this in their names stay as they are: they write metres and places. So do sums, which in 8 bits cost ten
@@ -113,7 +113,7 @@ def _quantise(file: Path, feeds: Sequence[Feeds], twin: Path) -> None:
 
 
 def _entries(nodes: Sequence[onnx.NodeProto]) -> list[str]:
-    """What the first layers look at: an 8-bit image less 128, alone or with planes."""
+    """Inputs of the first layers: an 8-bit image minus 128, alone or with planes."""
     greys = {node.output[0] for node in nodes if _is_grey(node, nodes)}
     together = [node.output[0] for node in nodes if node.op_type == "Concat" and greys & set(node.input)]
     return together or sorted(greys)
@@ -124,7 +124,7 @@ def _is_grey(node: onnx.NodeProto, nodes: Sequence[onnx.NodeProto]) -> bool:
 
 
 def _enter_as_it_is(graph: onnx.GraphProto, name: str) -> None:
-    """The image's 8-bit numbers need not become 32-bit ones and 8-bit ones again; planes beside it do once."""
+    """Feed the image's 8-bit numbers to the first layer as they are; quantise only the planes beside it."""
     made_by = {output: node for node in graph.node for output in node.output}
     (to_8_bits,) = (n for n in graph.node if n.op_type == "QuantizeLinear" and n.input[0] == name)
     entry, (_, scale, zero) = made_by[name], to_8_bits.input
@@ -142,7 +142,7 @@ def _enter_as_it_is(graph: onnx.GraphProto, name: str) -> None:
 
 
 def _spread_in_8_bits(graph: onnx.GraphProto) -> None:
-    """Channels that become pixels do so before they are made 32-bit numbers of: a quarter of the memory."""
+    """Turn channels into pixels before dequantising: a quarter of the memory."""
     made_by = {output: node for node in graph.node for output in node.output}
     for spread in [node for node in graph.node if node.op_type == "DepthToSpace"]:
         back = made_by.get(spread.input[0])
@@ -157,7 +157,7 @@ def _spread_in_8_bits(graph: onnx.GraphProto) -> None:
 
 
 def _drop_unused(graph: onnx.GraphProto) -> None:
-    """Nodes and weights that nobody reads any more."""
+    """Remove nodes and weights without a reader."""
     told = {output.name for output in graph.output}
     while True:
         read = told.union(*(node.input for node in graph.node))

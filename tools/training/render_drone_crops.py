@@ -1,4 +1,4 @@
-"""Render crops of single drones as the distance network is shown them: many more than whole images would give.
+"""Render crops of single drones for the distance network: many more than whole images would give.
 
     python -m tools.training.render_drone_crops OUT --worlds 300 --scenes 300
     python -m tools.training.render_drone_crops OUT --mesh MY.glb --size-m 0.55 --worlds 40
@@ -39,7 +39,7 @@ PAINTED, SHAPES_PAINTED, OWN_PAINTED = 8, 3, 12
 """Drones of each family, of each generated shape and of a mesh in a world, painted differently."""
 MOST_DRONES = 3
 MIN_PIXELS = 8
-"""That much of it must be seen: a drone six pixels wide is still to be told from a bird."""
+"""Least visible pixels of a drone: one that is six pixels wide still differs from a bird."""
 HIDDEN_SHARE = 0.02
 """Hidden share of its outline below which a drone is whole."""
 WITH_DISTRACTORS, DISTRACTOR_ALONE = 0.3, 0.1
@@ -62,7 +62,7 @@ class CropJob:
     own: Sequence[DroneModel]
     """The drone that flies alone, in several states; empty: many kinds fly."""
     measures: bool
-    """Also note `range_m`, and whether the drone is `whole`: within the image, and nothing before it."""
+    """Also store `range_m`, and whether the drone is `whole`: inside the image and not hidden."""
 
 
 def main() -> None:
@@ -96,7 +96,7 @@ def main() -> None:
 
 
 def own_drone(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> list[DroneModel]:
-    """The drone that ``--mesh`` names; none where it names none."""
+    """The drone of ``--mesh``, in several states; empty without it."""
     if not arguments.mesh:
         return []
     if arguments.size_m is None:
@@ -201,7 +201,7 @@ def _scene(
 
 
 def _is_whole(drone: DroneInView, view: Any, matrix: Array, corner: tuple[int, int]) -> bool:
-    """Within the camera's image, whose part from ``corner`` on the view shows, and hardly anything before it."""
+    """Whether the drone is inside the image and hardly hidden; the view is the image's part from ``corner`` on."""
     places = drone.model.vertices @ drone.rotation.T + drone.centre
     if places[:, 2].min() < 0.05:
         return False
@@ -215,7 +215,7 @@ def _is_whole(drone: DroneInView, view: Any, matrix: Array, corner: tuple[int, i
 
 
 def _places(position: Array, R_ned_camera: Array, focal: float, count: int, rng: np.random.Generator) -> Array:
-    """The first drone anywhere in the picture or just across its border, the others in about the same direction."""
+    """Places (count, 3), NED m: the first drone in the picture or just outside, the others near its direction."""
     u = rng.uniform(-15, WIDTH + 15) - WIDTH / 2
     v = np.clip(rng.normal(HEIGHT / 2, HEIGHT / 5), 0, HEIGHT) - HEIGHT / 2
     rays = np.array([[u / focal, v / focal, 1.0]]) + np.vstack([np.zeros(3), rng.normal(0, 0.12, (count - 1, 3))])

@@ -107,7 +107,7 @@ def render_world(job: PairJob) -> None:
 
 
 def _standing(field: ObstaclesConfig | None, seed: int) -> tuple[ObstaclesConfig | None, Obstacles | None]:
-    """The drawn obstacles where they stand; where there is no room for so many, a fifth fewer, and again."""
+    """The drawn obstacles with their places; as long as there is no room, a fifth fewer."""
     if field is None:
         return None, None
     while True:
@@ -119,7 +119,7 @@ def _standing(field: ObstaclesConfig | None, seed: int) -> tuple[ObstaclesConfig
 
 
 def _places_among(world: Any, count: int, rng: np.random.Generator, extent_m: float) -> Array:
-    """(count, 2) between obstacles, half of them in front of the nearest of four times as many."""
+    """Places (count, 2) between obstacles; half are the nearest to obstacles of four times as many."""
     free = world.free_points(4 * count, rng, NEAREST_M, within_m=extent_m)
     near = free[np.argsort(world.obstacle_distance(free))[: count // 2]]
     return np.concatenate([near, free[rng.permutation(len(free))[: count - len(near)]]])

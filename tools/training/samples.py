@@ -1,4 +1,4 @@
-"""Training samples, drawn endlessly from rendered pairs."""
+"""Training samples from rendered pairs."""
 
 from __future__ import annotations
 
@@ -92,12 +92,12 @@ class DroneInView:
 
 
 def crop_around(drone: DroneInView, rng: np.random.Generator) -> VirtualCrops:
-    """Where the second stage might look at a drone."""
+    """A crop in which the second stage may get the drone."""
     return crop_at(drone.centre, drone.model.size_m, drone.focal, rng)
 
 
 def crop_at(centre: NDArray[Any], size_m: float, focal: float, rng: np.random.Generator) -> VirtualCrops:
-    """Where the second stage might look, see ``drawn_fill``."""
+    """A crop in which the second stage may get a drone at ``centre`` (3,), camera axes, m; see ``drawn_fill``."""
     fill, off = drawn_fill(rng)
     half_width = size_m / 2 * fill
     shift_m = off * half_width
@@ -108,9 +108,9 @@ def crop_at(centre: NDArray[Any], size_m: float, focal: float, rng: np.random.Ge
 
 
 def drawn_fill(rng: np.random.Generator) -> tuple[float, NDArray[np.float64]]:
-    """The crop's width in sizes of its drone, and how far it is aimed right and down of it in halves of that width.
+    """The crop's width in drone sizes, and its aiming error (2,), right and down, in half widths.
 
-    Half of the time as aimed by the first network, else by itself.
+    Half of the time as aimed by the first stage, else as by the second.
     """
     aimed = rng.random() < 0.5
     # How much of the crop the drone fills must say nothing about metres: it is drawn apart from family and range.
@@ -137,7 +137,7 @@ def sample_of(drone: DroneInView, crop: VirtualCrops, image: NDArray[Any], mine:
 
 
 def four_motors(hubs: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Those four of a drone's motors (n, 3) that spread about as far one way as another, and then farthest."""
+    """The four of a drone's motors (n, 3) with the largest spread in both directions."""
     if len(hubs) == 4:
         return hubs
 
@@ -157,7 +157,7 @@ def _mask_of(crop: VirtualCrops, mine: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 def no_drone_sample(pairs: PairSet, negative: NDArray[Any] | None, rng: np.random.Generator) -> Sample:
-    """A crop of something else: a row of negatives.npy (tools.training.mine), or anywhere in any image."""
+    """A crop without a drone: at a row of negatives.npy (tools.training.mine), or anywhere in any image."""
     if negative is not None:
         pair, k = int(negative[0]), int(negative[1])
         middle, half_px = negative[2:4] + rng.normal(0, 0.15, 2) * negative[4], negative[4]
@@ -177,7 +177,7 @@ def no_drone_sample(pairs: PairSet, negative: NDArray[Any] | None, rng: np.rando
 
 
 def sample_without_drone(crop: VirtualCrops, image: NDArray[Any]) -> Sample:
-    """What ``crop`` shows of the camera's ``image``, where nothing is to be found."""
+    """What ``crop`` shows of the camera's ``image`` (h, w, 3), without a drone."""
     (picture,), _ = crop.sample({"camera": image})
     return {
         "picture": picture,
@@ -221,9 +221,9 @@ def flow_sample(pairs: PairSet, index: int, rng: np.random.Generator, size: tupl
 def warped(
     image: NDArray[np.uint8], behind: NDArray[np.uint8], rng: np.random.Generator
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_]]:
-    """The image after a motion of its own plane, the flow (2, h, w) that led there, and where it is known.
+    """The image after a projective motion, the flow (2, h, w) in pixels, and where the flow is known (h, w).
 
-    ``behind`` (h, w, 3) shows where nothing of the image came to lie.
+    ``behind`` (h, w, 3) fills the rest.
     """
     height, width = image.shape[:2]
     middle = np.array([width / 2, height / 2])
@@ -278,6 +278,6 @@ def _across(centre: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
 
 
 def _in_view(point: NDArray[Any], focal: float) -> NDArray[Any]:
-    """The point itself, or the nearest at its depth that is inside the picture."""
+    """The point (3,), or the nearest one at its depth inside the picture."""
     reach = np.array([WIDTH / 2 - 1, HEIGHT / 2 - 1]) / focal * point[2]
     return np.append(np.clip(point[:2], -reach, reach), point[2])

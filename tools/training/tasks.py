@@ -1,4 +1,4 @@
-"""What each network is trained on, and against what."""
+"""The training tasks: network, samples and loss."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from tools.training.weights import begin_with
 Batch = dict[str, Tensor]
 WINDOW_PX = 256
 NO_NAME = -1
-"""The name of a shape that is no family of its own in the training's hint."""
+"""Class of a shape that belongs to no family; the loss ignores it."""
 
 
 class Task:
-    """What is trained, on what, against what."""
+    """A network, its training samples and its loss."""
 
     def __init__(self, net: nn.Module, batch: int, rate: float) -> None:
         self.net, self.batch, self.rate = net, batch, rate
@@ -35,7 +35,7 @@ class Task:
         begin_with(self.net, weights)
 
     def begin(self) -> None:
-        """From now on the network learns."""
+        """Set the network to training mode."""
         self.net.train()
 
     def sample(self, rng: np.random.Generator) -> Sample:
@@ -43,11 +43,11 @@ class Task:
         raise NotImplementedError
 
     def batch_samples(self, rng: np.random.Generator) -> list[Sample]:
-        """One batch of them."""
+        """The samples of one batch."""
         return [self.sample(rng) for _ in range(self.batch)]
 
     def loss(self, batch: Batch) -> tuple[Tensor, dict[str, float]]:
-        """The loss and figures worth watching."""
+        """The loss, and figures to print."""
         raise NotImplementedError
 
 
@@ -107,7 +107,7 @@ class DistanceTask(Task):
     renewed_in_a_batch = 3
     no_drone_share = 0.25
     teacher: DistanceNet | None = None
-    """A network that saw more places: what it is sure is no drone, this one is to be as sure of (learning without
+    """The network at the start: where it rejects a crop, this one has to reject it as surely (learning without
     forgetting, Li and Hoiem 2016)."""
 
     def __init__(self, data: Path) -> None:
@@ -119,7 +119,7 @@ class DistanceTask(Task):
         self.negatives, self.no_drones = np.load(negatives), list[Sample]()
 
     def go_on_from(self, weights: Mapping[str, Tensor]) -> None:
-        """See ``Task``. What they are sure of is not forgotten."""
+        """See ``Task``. They also become the teacher."""
         super().go_on_from(weights)
         self.teacher = copy.deepcopy(self.net).eval()
 
@@ -185,13 +185,13 @@ class DistanceTask(Task):
 
 
 class SigmaTask(Task):
-    """How far a trained ``DistanceNet`` may misjudge a drone's size, also one that it has never seen; nothing else.
+    """The error of a drone's size that a trained ``DistanceNet`` states, also for drones that it has not seen.
 
     Ranges, centres and masks stay as they are: only ``doubt`` learns. Shapes of the generator stand for the unknown.
     """
 
     known_share = 0.8
-    """What the families that the network learnt count in the loss; as many of the drawn drones are shapes."""
+    """Weight of known families in the loss, of 1; half of the drones are shapes."""
 
     def __init__(self, data: Path) -> None:
         super().__init__(DistanceNet(), 64, 1e-3)
@@ -200,7 +200,7 @@ class SigmaTask(Task):
             weights.requires_grad = name.startswith("doubt.")
 
     def begin(self) -> None:
-        """See ``Task``. Its normalisations learn nothing either."""
+        """See ``Task``. Its normalisations stay as they are."""
         self.net.eval()
 
     def sample(self, rng: np.random.Generator) -> Sample:
@@ -223,7 +223,7 @@ class SigmaTask(Task):
 
 
 def _size_error(out: Tensor, batch: Batch) -> Tensor:
-    """(n,) by how much the logarithm of the size in metres is misjudged."""
+    """(n,) absolute error of the logarithm of the size in metres."""
     return (out[:, 0] + out[:, 5] - batch["target"][:, 0] - batch["apparent"]).abs()
 
 
@@ -245,7 +245,7 @@ def _mask_loss(logits: Tensor, mask: Tensor, drone: Tensor) -> tuple[Tensor, flo
 
 
 def _flipped(batch: Batch) -> Batch:
-    """Another half of the crops each time left to right, a tenth in strange colours, all in another light."""
+    """The batch with half of the crops mirrored, a tenth in permuted colours, all in another light."""
     n, device = len(batch["picture"]), batch["picture"].device
     mirror = torch.rand(n, device=device) < 0.5
     sign = torch.where(mirror, -1.0, 1.0)
@@ -262,7 +262,7 @@ def _flipped(batch: Batch) -> Batch:
 
 
 def _patched(batch: Batch) -> Batch:
-    """Half of the crops without a drone get a rectangle of another one of them: more kinds of what is no drone."""
+    """The batch in which half of the crops without a drone have a rectangle of another such crop."""
     none = torch.nonzero(batch["drone"] < 0.5)[:, 0]
     picture = batch["picture"].clone()
     size = picture.shape[1]
@@ -286,7 +286,7 @@ def _motor_maps(motors: Tensor, sigma: float = 1.5) -> Tensor:
 
 
 class FlowTask(Task):
-    """Where each pixel went."""
+    """Optical flow between two images."""
 
     def __init__(self, data: Path) -> None:
         super().__init__(FlowNet(), 16, 6e-4)

@@ -77,7 +77,7 @@ def main() -> None:
 
 
 def start(task: Task, weights: Path, seed: int) -> None:
-    """Give the task's network the weights of another run, or of a network that it or another one exported.
+    """Give the task's network the weights of another run (.pt), or of an exported network (.onnx).
 
     Raises ValueError where an ONNX file is of another network.
     """
@@ -90,9 +90,9 @@ def start(task: Task, weights: Path, seed: int) -> None:
 
 
 def train(task: Task, out: Path, budget_s: float, seed: int, workers: int) -> None:
-    """One cosine-shaped run of ``budget_s`` seconds of training; so many ``workers`` (processes) draw the samples.
+    """Train for ``budget_s`` seconds with a cosine learning rate; ``workers`` processes draw the samples.
 
-    What is kept is the mean of the weights over about the last thousand steps: each step's own errs to all sides.
+    The result is the mean of the weights over about the last thousand steps, which has less noise than those of a step.
     """
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     net = task.net.to(device).to(memory_format=torch.channels_last)
@@ -146,7 +146,7 @@ def train(task: Task, out: Path, budget_s: float, seed: int, workers: int) -> No
 
 
 def _recent_mean(mean: Tensor, new: Tensor, count: Tensor) -> Tensor:
-    """Running mean of floating-point weights; counters are taken as they are."""
+    """Running mean of floating-point weights; counters are copied."""
     if not mean.is_floating_point():
         return new
     share = max(1e-3, 1.0 / (1.0 + 0.1 * float(count)))
@@ -154,14 +154,14 @@ def _recent_mean(mean: Tensor, new: Tensor, count: Tensor) -> Tensor:
 
 
 def batches(task: Task, seed: list[int], workers: int) -> Iterator[Batch]:
-    """Without end; ``workers`` processes make the next ones while the last one is learnt from."""
+    """Batches without end; ``workers`` processes make the next ones during a step."""
     yield from DataLoader(
         _Batches(task, seed), batch_size=None, num_workers=workers, prefetch_factor=3, multiprocessing_context="fork"
     )
 
 
 class _Batches(IterableDataset[Batch]):
-    """Of a task; every process that iterates draws others."""
+    """The batches of a task; each process draws different ones."""
 
     def __init__(self, task: Task, seed: list[int]) -> None:
         self._task, self._seed = task, seed

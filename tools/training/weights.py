@@ -1,4 +1,4 @@
-"""Weights of an exported network, for training to go on where only its ONNX file is left.
+"""Weights of an exported network, to continue its training from the ONNX file.
 
 Export folds each batch normalisation into the convolution before it. Here the two are parted again, so that the
 network says the same as before and training can go on with it.
@@ -18,13 +18,13 @@ from torch import Tensor, nn
 from tools.training.networks import first_layers_of
 
 BOXES = "detector."
-"""What `detector.Boxes`, which is exported, calls the network that is trained."""
+"""Prefix of the trained network's weights in `detector.Boxes`, which is exported."""
 HALVED = "_16"
 """Ends the names of weights that are stored in 16 bits."""
 
 
 def begin_with(net: nn.Module, weights: Mapping[str, Tensor]) -> None:
-    """Take over what fits; of a layer that has grown, the part that was there."""
+    """Copy the weights of layers with the same name; of a larger layer the part that was there."""
     own = net.state_dict()
     for name, value in weights.items():
         if name in own and own[name].dim() == value.dim():
@@ -71,7 +71,7 @@ def _settle_norms(net: nn.Module, biases: Mapping[nn.BatchNorm2d, Tensor], run: 
 
 
 def _settled_to(bias: Tensor) -> Callable[[nn.BatchNorm2d, tuple[Tensor]], None]:
-    """What makes a normalisation add ``bias`` and do nothing else, to the very batch that comes in."""
+    """A hook that sets a normalisation so that it only adds ``bias`` to its input batch."""
 
     def settle(norm: nn.BatchNorm2d, inputs: tuple[Tensor]) -> None:
         x = inputs[0].float()
@@ -122,6 +122,6 @@ def _module(node: str) -> str:
 
 
 def _norm_after(bias: str) -> str:
-    """A unit's parts are numbered, or of the detector named."""
+    """The normalisation after a convolution: parts of a unit are numbered, those of the detector named."""
     layer = bias.removesuffix(".bias")
     return layer.removesuffix("conv") + "norm" if layer.endswith(".conv") else layer.removesuffix("0") + "1"

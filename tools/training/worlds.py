@@ -1,6 +1,6 @@
-"""Which worlds and which drones are for what, how they are held, and what else flies.
+"""Seeds of worlds, drone families, attitudes and distractors of training, validation and test.
 
-Training, validation and test worlds never meet; flights use seeds below all of them. Families are rows of
+The seeds of training, validation and test do not overlap; flights use seeds below all of them. Families are rows of
 ``flockd.sim.renderer.drone_models``: the unseen ones are left out of training, to test on drones that no network knows.
 Shapes are those of ``tools.training.drone_generator``: training worlds have them besides the families.
 """
@@ -38,7 +38,7 @@ SHAPES_SHARE = 1 / 2
 
 
 def drawn_obstacles(seed: int, share: float) -> ObstaclesConfig | None:
-    """What stands in the middle of a world to be flown around: nothing in all but ``share`` of the worlds."""
+    """A forest or a village in the middle of a world, with probability ``share``; else None."""
     rng = np.random.default_rng([seed, 5])
     if rng.random() >= share:
         return None
@@ -66,7 +66,7 @@ def attitude(yaw: float, tilt: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def drawn_attitude(rng: np.random.Generator) -> NDArray[np.float64]:
-    """Any heading, and the tilt of a multirotor on its way."""
+    """R_ned_body (3, 3) of any heading, and the tilt of a multirotor in flight."""
     return attitude(rng.uniform(-np.pi, np.pi), rng.normal(0, np.radians(7), 2))
 
 
@@ -81,7 +81,7 @@ def outline_of(corners: NDArray[Any], matrix: NDArray[Any], shape: tuple[int, ..
 
 @dataclass(frozen=True, eq=False)
 class Distraction:
-    """A thing on its way."""
+    """A distractor in motion."""
 
     thing: Distractor
     place: Array
@@ -95,7 +95,7 @@ class Distraction:
     """Beat of the wings: amplitude and phase, rad, and rad/s."""
 
     def at(self, time_s: float) -> tuple[Distractor, Array, Array]:
-        """As it is after some time, its turn (3, 3) R_ned_body and its place (3,) NED m."""
+        """Its mesh after some time, its attitude R_ned_body (3, 3), and its place (3,) NED m."""
         amplitude, phase, rate = self.beat
         roll, pitch, yaw = self.turn * time_s
         return (
@@ -108,7 +108,7 @@ class Distraction:
 def drawn_distractions(
     count: int, position: Array, R_ned_camera: Array, focal: float, ground: float, rng: np.random.Generator
 ) -> list[Distraction]:
-    """So many, all over the camera's picture; ``ground``: its height."""
+    """Distractors all over the camera's picture; ``ground``: height of the ground, m."""
     right, down = rng.uniform(-WIDTH / 2, WIDTH / 2, count), rng.uniform(-HEIGHT / 2, HEIGHT / 4, count)
     rays = np.column_stack([right / focal, down / focal, np.ones(count)])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
@@ -116,7 +116,7 @@ def drawn_distractions(
 
 
 def drawn_distraction(position: Array, ray: Array, ground: float, rng: np.random.Generator) -> Distraction:
-    """One in the direction of a ray (3,), NED; six out of ten are birds."""
+    """A distractor in the direction of a ray (3,), NED; six out of ten are birds."""
     place = position + ray * np.exp(rng.uniform(np.log(1.5), np.log(30.0)))
     place[2] = min(place[2], -(ground + 0.5))
     heading, still = rng.uniform(-np.pi, np.pi), np.zeros(3)

@@ -1,4 +1,4 @@
-"""What a check found, how it gets out of the virtual machine, and what all checks do; of the standard library alone."""
+"""The finding of a check, its way out of the virtual machine, and what all checks use; standard library only."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 
 UNIT = "flockd.service"
 PATIENCE_S = 180.0
-"""As long as an emulated processor may need for anything."""
+"""Limit of each wait; an emulated processor is slow."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ Check = Callable[[], Iterator[Finding]]
 
 
 def run_checks(path: Path, checks: Iterable[Check]) -> None:
-    """Writes a line of JSON for each finding as it comes: what the machine does not live to write has failed.
+    """Write a line of JSON for each finding as it comes; a check without one has failed.
 
     A check that breaks has failed, and the next one runs.
     """
@@ -57,7 +57,7 @@ def soon(check: str, took_s: float, limit_s: float, row: int | None = None) -> F
 
 
 def until(condition: Callable[[], bool], what: str, *, look_s: float = 0.1) -> float:
-    """When it became so, on the monotonic clock. Raises TimeoutError, which names what was waited for."""
+    """Wait for the condition; the time on the monotonic clock. Raises TimeoutError, which names ``what``."""
     begun_s = time.monotonic()
     while not condition():
         if time.monotonic() - begun_s > PATIENCE_S:

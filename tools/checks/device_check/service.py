@@ -46,11 +46,11 @@ WATCHED_S = 10.0
 LITTLE_MEMORY, OUT_OF_MEMORY_S = "32M", 5.0
 """For the process, which has a few hundred megabytes; until Linux has killed it and the autopilot has noticed."""
 LOOK_S = 0.5
-"""To ask systemd keeps an emulated processor busy for a while; when things happened it knows exactly."""
+"""Asking systemd takes an emulated processor a while; systemd itself has exact times."""
 
 
 class Service:
-    """The unit, and whom it talks to."""
+    """The unit, its fake autopilot and its watcher."""
 
     def __init__(self, start: str) -> None:
         """``start``: the lines of the documentation that start the unit."""
@@ -64,7 +64,7 @@ class Service:
         )
 
     def close(self) -> None:
-        """Leaves no process behind."""
+        """End all processes."""
         self._watcher.close()
         self._autopilot.close()
         if self._front is not None:
@@ -231,7 +231,7 @@ class Service:
         until(lambda: not self._autopilot.armed, "the landing")
 
     def _fly(self) -> None:
-        """As its pilot would, once flockd has seen it on the ground."""
+        """Arm, take off and select offboard, once flockd has seen the vehicle on the ground."""
         until(
             lambda: "started" not in [reason["event"] for reason in self._message("flight")["reasons"]],
             "flockd to see the vehicle on the ground",
@@ -248,7 +248,7 @@ class Service:
         return counts
 
     def _message(self, topic: str, since_s: float | None = None) -> Mapping[str, Any]:
-        """The first that was sent later than that, or than now."""
+        """The first message of a topic that was sent after a time, by default now."""
         since_s = time.monotonic() if since_s is None else since_s
 
         def newest() -> list[Mapping[str, Any]]:
