@@ -151,6 +151,9 @@ def _replay(args: argparse.Namespace, recording: Recording) -> int:
         _say_result(args, comparison, result)
         if watch is not None:
             _say_profile(args, result["profile"])
+    if len(replay.blind) == len(replay.outputs):
+        complain(f"{recording.path}: no image could be used: {replay.blind[0]}")
+        return ExitCode.CHECK_FAILED
     return ExitCode.CHECK_FAILED if comparison is not None and comparison.first else ExitCode.DONE
 
 

@@ -15,7 +15,7 @@ import yaml
 from flockd.cli import main
 from flockd.core.config import Overrides
 from flockd.core.data import data_path
-from flockd.core.messages import FrameSet, PilotOutput
+from flockd.core.messages import FrameSet, PilotOutput, Reason, ReasonKind
 from flockd.flight.inference.manifest_file import model_hashes
 from flockd.onboard.recording import Recorder
 from flockd.onboard.recording.reader import Recording
@@ -63,6 +63,18 @@ def test_a_replay_equals_the_flight(path: Path, told: Told) -> None:
     assert second.startswith("equal in all ")
     result = json.loads(told(0, "replay", path, "--diff", "--json"))
     assert (result["steps"], result["diff"]["equal"], result["warnings"]) == (10, True, [])
+
+
+def test_a_replay_that_can_use_no_image_fails(path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+    class Refusing(MadeUpPilot):
+        def step(self, *inputs: Any, **order: Any) -> PilotOutput:
+            refused = (Reason(ReasonKind.INPUT, "input refused: the attitude is not a rotation"),)
+            return replace(super().step(*inputs, **order), reasons=refused)
+
+    monkeypatch.setattr("flockd.review.replay.recorded_flight.FlockPilot", Refusing)
+    assert main(["replay", str(path)]) == 1
+    told = f"{path}: no image could be used: input refused: the attitude is not a rotation\n"
+    assert capsys.readouterr().err == told
 
 
 def test_the_first_difference_is_told_with_time_drone_field_and_both_values(nudged: Path, capsys: Capture) -> None:

@@ -32,13 +32,8 @@ def text(pattern: str, words: str) -> Any:
 
 WORDS = "words"
 """The key of a JSON schema that holds the words given to `text`."""
-Name = Annotated[
-    str,
-    text(
-        r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}$",
-        "a name, of up to 64 letters, digits, `_`, and, not in the first place, `.` and `-`",
-    ),
-]
+NAME = r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}$"
+Name = Annotated[str, text(NAME, "a name, of up to 64 letters, digits, `_`, and, not in the first place, `.` and `-`")]
 PlainName = Annotated[str, text(r"^[a-z0-9_-]+$", "a name, of small letters, digits, `_` and `-`")]
 
 

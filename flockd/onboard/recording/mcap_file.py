@@ -217,7 +217,14 @@ class _Reader:
             offset = self._file.tell()
             head = self._file.read(_HEAD.size)
             opcode, length = _HEAD.unpack(head) if len(head) == _HEAD.size else (0, 0)
-            if opcode == Opcode.DATA_END:
+            if opcode == Opcode.FOOTER:
+                end = self._file.seek(length + len(_MAGIC), io.SEEK_CUR)
+                if end < self._size:
+                    yield Damage(
+                        end,
+                        f"{self._size - end:,} bytes, as of a second file, follow its end and are not read",
+                        at_end=False,
+                    )
                 return
             if opcode == 0 or offset + _HEAD.size + length > self._size:
                 yield Damage(offset, "it stops without an end", at_end=True)

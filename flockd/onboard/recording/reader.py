@@ -19,6 +19,7 @@ from pydantic import ValidationError
 
 from flockd.core import gone
 from flockd.core.config import DroneConfig
+from flockd.core.config.base import NAME
 from flockd.core.jpeg_header import cost_fault
 from flockd.core.messages import Frame, FrameSet, LearnedSize, MissionOrder, UInt8Array, VehicleState
 from flockd.onboard.message_json import from_json, parsed
@@ -102,6 +103,7 @@ class Recording:
         self.config, self.unknown = _config(self.path, self.contents)
         """The flight's configuration, and the keys of it that this version does not know or would refuse: with such
         keys the flight cannot be repeated exactly."""
+        self._sizes = {camera.name: camera.size_px for camera in self.config.rig.cameras}
         self.learned = _learned(self.path, self.contents.flight)
         """The others' size with which the flight's pilot began."""
 
@@ -164,7 +166,7 @@ class Recording:
             truth, order = read(streams.TRUTH, Truth), read(streams.ORDER, MissionOrder)
             frames = {}
             for entry in listed.frames:
-                image = decoded_image(messages[foxglove.image_stream(entry.camera).topic])
+                image = self._of_rig(entry.camera, decoded_image(messages[foxglove.image_stream(entry.camera).topic]))
                 frames[entry.camera] = Frame(entry.camera, image, entry.time_s, entry.sequence)
         except KeyError as error:
             if self.contents.damages:
@@ -173,6 +175,14 @@ class Recording:
         except (ValueError, RecordingError) as error:
             raise RecordingError(f"{self.path}: step {number} cannot be read ({error}); use another copy") from error
         yield RecordedStep(number, FrameSet(listed.time_s, frames), vehicle, output, truth, order)
+
+    def _of_rig(self, camera: str, image: UInt8Array) -> UInt8Array:
+        """The image. Raises ValueError if the rig has no such camera, or has it with another size."""
+        size = self._sizes.get(camera)
+        if size != image.shape[1::-1]:
+            known = f"its rig has it with {size[0]} x {size[1]}" if size else "its rig has no such camera"
+            raise ValueError(f"camera {camera} has {image.shape[1]} x {image.shape[0]} pixels, and {known}")
+        return image
 
 
 def head_of(path: Path) -> tuple[Note, Note, Inclosure]:
@@ -201,6 +211,9 @@ def head_of(path: Path) -> tuple[Note, Note, Inclosure]:
             if flight.facts.get("format") != streams.FORMAT:
                 known = f"format {flight.facts.get('format')!r}, and this flockd reads {streams.FORMAT!r}"
                 raise RecordingError(f"{path}: is of {known}; use the flockd that wrote it")
+            for fact, pattern in (("drone", NAME), ("images", "[a-z0-9]+")):
+                if not re.fullmatch(pattern, flight.facts.get(fact, "")):
+                    raise RecordingError(f"{path}: names no {fact} in its note of the flight; use another copy")
             return flight, models, configuration
     raise RecordingError(f"{path}: is an MCAP file, but not a recording of flockd; name one that flockd wrote")
 
@@ -236,6 +249,9 @@ def _note(found: Contents, path: Path, record: Record | Damage) -> None:
         case Entry(stream, _, sequence, data):
             found.messages[stream.topic] += 1
             if stream.topic == streams.FRAMES.topic:
+                if found.steps and sequence <= (last := found.steps[-1][0]):
+                    told = f"step {sequence} comes behind step {last}, as in recordings that were joined"
+                    raise RecordingError(f"{path}: {told}; use those themselves")
                 found.steps.append((sequence, _time_of(path, data)))
         case Note(name, facts_of_end) if name == streams.END_NOTE:
             if not re.fullmatch("[0-9]{1,9}", lost := facts_of_end.get("lost", "0")):

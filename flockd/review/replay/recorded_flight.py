@@ -12,6 +12,7 @@ from typing import Any
 from flockd.core.config import DroneConfig
 from flockd.core.config.drone import RecordingConfig
 from flockd.core.data import written_whole
+from flockd.core.messages import ReasonKind
 from flockd.flight.inference.manifest_file import model_hashes
 from flockd.flight.pilot import FlockPilot
 from flockd.onboard.daemon import load_side_by_side
@@ -36,6 +37,8 @@ class Replay:
     """Time of each step's frames."""
     steps_ms: list[float] = field(default_factory=list)
     """Real time of each step."""
+    blind: list[str] = field(default_factory=list)
+    """Why no image was used, of each such step."""
     processor_ms: list[float] = field(default_factory=list)
     """Processor time of each, all threads together."""
     stages_ms: dict[str, list[float]] = field(default_factory=dict)
@@ -74,6 +77,9 @@ def replay_flight(
             replay.processor_ms.append(1e3 * (time.process_time() - processor_begin_s))
             replay.times_s.append(step.frames.time_s)
             replay.outputs[step.number] = to_json(output)
+            refused = any(reason.kind is ReasonKind.INPUT for reason in output.reasons)
+            if refused or not step.frames.frames.keys() - set(output.noisy_cameras):
+                replay.blind.append(str(output.reasons[0]) if output.reasons else "it has none")
             if step.output is not None:
                 replay.recorded[step.number] = step.output
             for stage, ms in output.stages_ms.items():

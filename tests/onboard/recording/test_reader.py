@@ -59,6 +59,40 @@ def test_what_is_no_recording_is_refused_in_one_sentence(tmp_path: Path, whole: 
     content = whole.read_bytes()
     path.write_bytes(content.replace(b"\x01\x00\x00\x001", b"\x01\x00\x00\x002", 1))
     assert "is of format '2', and this flockd reads '1'; " in refusal(path)
+    for number, fact in enumerate(({"drone": "../../x"}, {"drone": ""}, {"images": ""})):
+        changed = with_facts(whole, tmp_path / f"{number}.mcap", **fact)
+        assert f"names no {next(iter(fact))} in its note of the flight; " in refusal(changed)
+
+
+def test_recordings_that_were_joined_are_not_taken_for_one_flight(tmp_path: Path, whole: Path) -> None:
+    """By `mcap merge`, which sorts all messages by time, and by `cat`."""
+    found = [record for record in read_records(whole) if not isinstance(record, Damage)]
+    with McapFile(tmp_path / "merged.mcap") as merged:
+        for one in sorted(found * 2, key=lambda one: one.time_ns if isinstance(one, Entry) else 0):
+            merged.write(one)
+    assert "step 0 comes behind step 0, as in recordings that were joined; " in refusal(merged.path)
+    content = whole.read_bytes()
+    (tmp_path / "cat.mcap").write_bytes(2 * content)
+    (damage,) = Recording(tmp_path / "cat.mcap").contents.damages
+    assert (damage.offset, damage.at_end) == (len(content), False)
+    assert f"{len(content):,} bytes, as of a second file, follow its end" in damage.reason
+
+
+def test_images_that_the_rig_does_not_have_are_refused(tmp_path: Path, whole: Path) -> None:
+    """The rig's are of 160 x 120 pixels, its cameras front and left."""
+    for key, other, fault in (("name", "top", "no such camera"), ("size_px", [320, 240], "has it with 320 x 240")):
+
+        def changed(found: Record, key: str = key, other: object = other) -> Record:
+            if not isinstance(found, Inclosure):
+                return found
+            config = json.loads(found.data)
+            config["rig"]["cameras"][0] |= {key: other}
+            config["rig"]["cameras"][0]["intrinsics"] |= {"cx": 160.0, "cy": 120.0} if key == "size_px" else {}
+            return replace(found, data=json.dumps(config).encode())
+
+        recording = Recording(rewritten(whole, tmp_path / f"{key}.mcap", changed))
+        with pytest.raises(RecordingError, match=f"step 0 .*camera front has 160 x 120 pixels, and its rig .*{fault}"):
+            list(recording.steps())
 
 
 def test_what_the_pilot_began_with_of_the_others_size_comes_back_to_the_last_bit(tmp_path: Path, whole: Path) -> None:
