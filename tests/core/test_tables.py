@@ -53,7 +53,8 @@ def test_every_key_that_is_an_age_or_a_time_out_of_a_message_is_in_the_table() -
 
 
 def test_reactions_that_are_events_are_in_the_supervisors_table() -> None:
-    named = {row.reaction for row in (*SERVICES, *CHECKS) if " " not in row.reaction}
+    reactions = {row.reaction for row in SERVICES} | {row.reaction for row in CHECKS}
+    named = {reaction for reaction in reactions if " " not in reaction}
     assert len(named) == 7
     assert named <= {event.value for event in rules(SafetyParameters())}
 

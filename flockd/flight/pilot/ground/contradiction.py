@@ -73,7 +73,7 @@ class ContradictionMonitor:
         """Blames the range finder if its readings stay equal while the height changes."""
         if self._same is None or point.range_m != self._same.range_m:
             self._same = point
-        elif abs(point.height_m - self._same.height_m) >= RANGE_REPEATED.limit:
+        elif abs(point.ground_m - self._same.ground_m) >= RANGE_REPEATED.limit:  # as of each reading's own time
             self.doubt("the range stays the same while the height changes")
 
     def see_way(self, elapsed_s: float, flown: FloatArray, by_images: FloatArray) -> None:
