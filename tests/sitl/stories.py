@@ -177,7 +177,8 @@ async def on_the_ground(world: World) -> None:
     await asyncio.sleep(2.0)  # the announcement is heard
     world.station.select(0, "LAND")
     await world.until(world.mode("land"), "Land")
-    await world.saw("arm in Land mode", lambda: _refused(link, "to arm"), "the refusal is shown before it is asked")
+    refused = lambda: any(refusal.refused == "to arm" for refusal in link.refusals())  # noqa: E731
+    await world.saw("arm in Land mode", refused, "the refusal is shown before it is asked")
     await world.asked("arm in Land mode", link.arm)
     world.texts()
     world.station.select(0, "LOITER")
@@ -236,14 +237,9 @@ async def in_flight(world: World) -> None:
     await world.asked("Acro in the air", lambda: link._command("for acro", 176, 1, 5, 0, refused="acro"))
     world.texts()
     station.select(0, "ACRO")
-    await world.saw("Acro for a station", lambda: _refused(link, "acro"), "the refusal is shown")
     await asyncio.sleep(1.0)
     world.rows.append(Row("Acro for a station", f"said: {'; '.join(world.texts()) or 'nothing'}"))
     await world.hold()
-
-
-def _refused(link: AutopilotLink, what: str) -> bool:
-    return any(refusal.refused == what for refusal in link.refusals())
 
 
 async def _lose_heartbeats(world: World) -> None:
