@@ -31,7 +31,7 @@ RANGE_GROUND = Check(
     "range to the ground, with the ground expected from the ranges before and the own motion",
     4.0,
     "SD",
-    "not used; the next one like it is, if the barometer does not contradict",
+    "it is not used; the next one like it is, unless the barometer contradicts it",
     "PX4's EKF2_RNG_GATE 5 SD",
     ("perception.range_finder.gate_sigma",),
 )
@@ -39,7 +39,7 @@ RANGE_BAROMETER = Check(
     "height of the ground by range finder and barometer, with the bounds that the ranges before leave it",
     1.0,
     "m",
-    "not of one range alone: the range finder is not used, the scale is the barometer's",
+    "after more than one such range the range finder is not used, and the scale is the barometer's",
     "steps of the ground, and a barometer's drift in 15 s; PX4's EKF2_RNG_K_GATE 0.5 SD needs level ground",
     ("perception.range_finder.tolerance_m",),
 )
@@ -55,7 +55,7 @@ RANGE_REPEATED = Check(
     "change of the barometer's height, while all ranges are the same to the last bit",
     0.5,
     "m",
-    "the range finder is not used before it says something else, and agrees",
+    "the range finder is not used until it gives another range, which agrees",
     "PX4's range_stuck_threshold 0.1 m; more, as a range in whole centimetres may repeat along a slope",
 )
 RANGE_VISION = Check(
@@ -66,10 +66,10 @@ RANGE_VISION = Check(
     "PX4's EKF2_EVV_GATE 3 SD; its velocity wanders by 0.15 m/s for seconds (measured in its simulator)",
 )
 EGO_MOTION = Check(
-    "velocity by the images, with the autopilot's less what it erred by before",
+    "velocity by the images, with the autopilot's velocity minus its known error",
     5.0,
     "SD",
-    "the ego-motion is refused, and the sigma grows until one that shows the same would not be",
+    "the ego-motion is refused, and sigma grows until one that shows the same is accepted",
     "PX4's EKF2_GPS_V_GATE 5 SD",
 )
 STAMP = Check(
@@ -77,7 +77,7 @@ STAMP = Check(
     0.005,
     "s",
     "messages count from when they arrive; after 1.5 s an event",
-    "a turn of 60 degrees a second is 0.3 degrees in it",
+    "in this time a turn of 60 degrees a second turns by 0.3 degrees",
 )
 RESPONSE_DEGRADED = Check(
     "velocity flown, with the one commanded (root mean square over ten seconds)",

@@ -171,7 +171,8 @@ class LocalFrame:
         )
 
     def turn(self, stamp_s: float, attitude: Sequence[float], rate: Sequence[float]) -> str | None:
-        """The same of unit quaternions w x y z from the body to NED and rates (3,) in rad/s of the body.
+        """Takes an attitude, a unit quaternion w x y z from the body to NED, and the body's rates (3,) in rad/s, by the
+        autopilot's clock; returns one sentence on a jump of the heading.
 
         Only the heading counts: of the rotation w x y z from the attitude predicted by the rates to the one that was
         sent, the turn about the vertical is 2 atan2(z, w).
