@@ -31,13 +31,14 @@ from flockd.onboard.autopilot.mavsdk_link import (
 )
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.autopilot.fake_range_finder import FakeRangeFinder, level_ground
+from flockd.sim.autopilot.fake_telemetry import Mode
 from flockd.sim.autopilot.fake_vehicle import Demand, MotionState
 from flockd.sim.scenario import RangeFinderConfig
 from flockd.sim.sitl.ground_station import GroundStation
 from flockd.sim.sitl.processes import free_port
 from tests.calm import clock
 from tests.onboard.autopilot.conftest import HEARTBEAT_S
-from tests.onboard.autopilot.flight import attended, flying, until
+from tests.onboard.autopilot.flight import Wire, attended, flying, until
 
 
 def _parameters(address: str, system_id: int | None = 1) -> AutopilotParameters:
@@ -82,6 +83,21 @@ async def test_telemetry_is_what_the_vehicle_does(port: int, address: str) -> No
         fake_autopilot.silent = True
         await until(lambda: link.status().heartbeat_age_s > 4 * HEARTBEAT_S)
         await link.close()
+
+
+async def test_what_another_component_of_its_system_sends_is_not_the_autopilots(
+    port: int, address: str, fake_autopilot: FakeAutopilot
+) -> None:
+    """A gimbal's heartbeat has a mode of its own, and goes on when the autopilot's does not."""
+    async with attended(address) as link:
+        fake_autopilot.silent = True
+        gimbal = mavlink.MAVLink(Wire(port), srcSystem=1, srcComponent=mavlink.MAV_COMP_ID_GIMBAL)
+        for _ in range(4):
+            await asyncio.sleep(HEARTBEAT_S)
+            gimbal.heartbeat_send(mavlink.MAV_TYPE_GIMBAL, mavlink.MAV_AUTOPILOT_INVALID, 0, 6 << 16, 4)
+        await asyncio.sleep(0.5 * HEARTBEAT_S)
+        assert link.status().heartbeat_age_s > 3 * HEARTBEAT_S
+        assert link.status().flight_mode == "hold"
 
 
 async def test_firmware_and_failsafe_parameters_can_be_read(address: str, fake_autopilot: FakeAutopilot) -> None:
@@ -206,6 +222,23 @@ async def test_a_setpoint_that_is_not_finite_never_leaves(address: str, fake_aut
     assert not fake_autopilot.setpoints
     assert fake_autopilot.refused_setpoints == 0
     await link.close()
+
+
+async def test_from_offboard_it_lands_by_way_of_hold(
+    address: str, fake_autopilot: FakeAutopilot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After a landing PX4 returns to the mode before, and cannot be armed in offboard."""
+    selected, select = list[str](), FakeAutopilot._select
+
+    def noted(autopilot: FakeAutopilot, mode: Mode, component: int) -> bool:
+        selected.append(mode)
+        return select(autopilot, mode, component)
+
+    monkeypatch.setattr(FakeAutopilot, "_select", noted)
+    async with flying(address) as flight:
+        await flight.enter_offboard()
+        await flight.link.land()
+    assert selected == ["OFFBOARD", "LOITER", "LAND"]
 
 
 def test_nobody_there_is_told_with_what_to_check(address: str) -> None:

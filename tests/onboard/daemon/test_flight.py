@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import socket
 from pathlib import Path
 from typing import Literal
 
@@ -24,7 +23,7 @@ from flockd.sim.sitl.processes import free_port
 from tests.calm import clock
 from tests.faults.stories import Reacted
 from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M
-from tests.onboard.autopilot.flight import until
+from tests.onboard.autopilot.flight import Wire, until
 from tests.onboard.daemon.aboard import CAMERAS, PATIENT, SECONDS_TO_FAIL, SPEED_M_S, STEP_S, TinyPerceiver, aboard
 
 ALONE = PATIENT.model_copy(update={"alone_s": None})
@@ -139,28 +138,17 @@ async def test_a_second_sender_with_the_autopilots_ids_moves_neither_height_band
     async with aboard(fake_autopilot, port, tmp_path) as ship:
         await ship.is_ready_in_the_air()
         await ship.flies()
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as wire:
-            forged = mavlink.MAVLink(_Sender(wire, port), srcSystem=1, srcComponent=1)
-            for _ in range(10):
-                forged.extended_sys_state_send(0, mavlink.MAV_LANDED_STATE_ON_GROUND)
-                forged.home_position_send(0, 0, 0, 500.0, 0.0, 20.0, [1.0, 0.0, 0.0, 0.0], 0.0, 0.0, 0.0)
-                await asyncio.sleep(0.1)
+        forged = mavlink.MAVLink(Wire(port), srcSystem=1, srcComponent=1)
+        for _ in range(10):
+            forged.extended_sys_state_send(0, mavlink.MAV_LANDED_STATE_ON_GROUND)
+            forged.home_position_send(0, 0, 0, 500.0, 0.0, 20.0, [1.0, 0.0, 0.0, 0.0], 0.0, 0.0, 0.0)
+            await asyncio.sleep(0.1)
         await ship.until_event("the autopilot's home moved by 500.4 m in flight")  # sqrt(500^2 + 20^2)
         await ship.until_event("the autopilot reports that the drone is on the ground")
         assert not {"fence_left", "heights_left"} & ship.matters()
         assert ship.state() in {"normal", "degraded"}
         assert fake_autopilot.mode == "OFFBOARD"
         assert fake_autopilot.setpoints[-1][1].sink_m_s == pytest.approx(0.0, abs=0.05)
-
-
-class _Sender:
-    """In a file's place, for pymavlink: sends to the daemon's port."""
-
-    def __init__(self, wire: socket.socket, port: int) -> None:
-        self._wire, self._port = wire, port
-
-    def write(self, data: bytes) -> None:
-        self._wire.sendto(data, ("127.0.0.1", self._port))
 
 
 def _replays_to_the_last_bit(recording: Recording) -> None:
