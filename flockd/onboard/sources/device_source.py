@@ -14,7 +14,7 @@ from flockd.onboard.sources.assembler import FrameReceiver
 from flockd.onboard.sources.child_device import CHILD, ROS_CHILD
 from flockd.onboard.sources.frames import CameraDevice, CameraError, CapturedBuffer, Count, RawFrame
 from flockd.onboard.sources.gstreamer_device import GstreamerDevice
-from flockd.onboard.sources.image_formats import CorruptImageError, ImageFormat, SharedImage
+from flockd.onboard.sources.image_formats import CapturedImage, CorruptImageError, ImageFormat
 from flockd.onboard.sources.ros_device import RosDevice
 from flockd.onboard.sources.v4l2_device import V4l2Device
 from flockd.onboard.sources.v4l2_kernel import Kernel
@@ -70,6 +70,8 @@ class DeviceSource(FrameReceiver):
             if first.crop is not None:
                 width, height = parameters.whole_px(first)
                 size = width // first.reduce, height // first.reduce
+            elif first.turn_deg % 180:
+                size = size[1], size[0]
             self._cameras.append(_Device(cameras, size, parameters.silence_s, self, devices or Devices()))
 
     def start(self) -> None:
@@ -100,9 +102,7 @@ class _Device(threading.Thread):
     ) -> None:
         first = cameras[0]
         super().__init__(name=f"camera-{first.name}", daemon=True)
-        self._parameters = first if first.crop is None else first.model_copy(update={"turn_deg": 0})
-        """Without a turn if the image is cut: each part has its own angle, and is turned when it is cut out."""
-        self._cameras, self._size, self._silence_s = cameras, size, silence_s
+        self._parameters, self._cameras, self._size, self._silence_s = first, cameras, size, silence_s
         self._receiver, self._devices = receiver, devices
         self._who = first.name
         self._delivered = False
@@ -176,8 +176,7 @@ def frames_of(
     cameras: Sequence[CameraDeviceParameters], captured: CapturedBuffer, image_format: ImageFormat
 ) -> Iterator[RawFrame]:
     """The frames of all cameras that are cut from one image; they share its data."""
-    whole = SharedImage(image_format)
+    image = CapturedImage(image_format)
     for camera in cameras:
-        decode = image_format.decode if camera.crop is None else whole.decoder(camera)
-        shared = camera.crop is not None
+        decode, shared = image.decoder(camera), camera.crop is not None
         yield RawFrame(camera.name, captured.data, decode, captured.time_s, captured.sequence, shared)

@@ -24,7 +24,6 @@ from flockd.onboard.sources.image_formats import (
     MjpegFormat,
     PackedFormat,
     check_length,
-    plausible,
 )
 
 PACKAGES = "libgstreamer1.0-0, gstreamer1.0-plugins-base and the plugins that its pipeline needs"
@@ -85,10 +84,6 @@ class PlanarFormat:
         self.check(data)
         planes = np.frombuffer(data, np.uint8).reshape(-1, self.size[0])
         return np.asarray(cv2.cvtColor(planes, _PLANAR[self.name]), np.uint8)
-
-    def decode(self, data: bytes) -> UInt8Array:
-        """See ``ImageFormat``."""
-        return plausible(self.pixels(data))
 
 
 def _formats(size: tuple[int, int]) -> tuple[str, ...]:

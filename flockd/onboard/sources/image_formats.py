@@ -54,9 +54,6 @@ class ImageFormat(Protocol):
     def pixels(self, data: bytes) -> UInt8Array:
         """(height, width, 3) RGB, whatever it shows. Raises CorruptImageError."""
 
-    def decode(self, data: bytes) -> UInt8Array:
-        """As `pixels`, and also raises CorruptImageError for an image without content: see `plausible`."""
-
 
 @dataclass(frozen=True)
 class MjpegFormat:
@@ -94,10 +91,6 @@ class MjpegFormat:
             image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
         return np.asarray(image, np.uint8)
 
-    def decode(self, data: bytes) -> UInt8Array:
-        """See ``ImageFormat``."""
-        return plausible(self.pixels(data))
-
 
 @dataclass(frozen=True)
 class PackedFormat:
@@ -122,25 +115,16 @@ class PackedFormat:
 
     def pixels(self, data: bytes) -> UInt8Array:
         """See ``ImageFormat``."""
-        return self._reduced(self._whole(data))
-
-    def decode(self, data: bytes) -> UInt8Array:
-        """See ``ImageFormat``."""
-        return self._reduced(plausible(self._whole(data)))
-
-    def _whole(self, data: bytes) -> UInt8Array:
         self.check(data)
         (width, height), (depth, conversion) = self.size, PACKED[self.name]
         across = up_to(2, width) if depth == 2 else width  # two pixels share their chroma
         rows = np.frombuffer(data, np.uint8).reshape(height, self._bytes_per_line())
         pixels = np.ascontiguousarray(rows[:, : depth * across]).reshape(height, across, depth)
         image = pixels if conversion is None else np.asarray(cv2.cvtColor(pixels, conversion), np.uint8)
-        return np.ascontiguousarray(image[:, :width])
-
-    def _reduced(self, whole: UInt8Array) -> UInt8Array:
+        whole = np.ascontiguousarray(image[:, :width])
         if self.reduce == 1:
             return whole
-        size = self.size[0] // self.reduce, self.size[1] // self.reduce
+        size = width // self.reduce, height // self.reduce
         return np.asarray(cv2.resize(whole, size, interpolation=cv2.INTER_AREA), np.uint8)
 
     def _bytes_per_line(self) -> int:
@@ -158,50 +142,34 @@ class RgbFormat:
         """See ``ImageFormat``: size."""
         check_length(data, self.size[0] * self.size[1] * 3)
 
-    def decode(self, data: bytes) -> UInt8Array:
+    def pixels(self, data: bytes) -> UInt8Array:
         """See ``ImageFormat``; nothing is copied."""
         self.check(data)
         return np.frombuffer(data, np.uint8).reshape(self.size[1], self.size[0], 3)
 
 
-@dataclass(frozen=True)
-class TurnedFormat:
-    """Images of a camera that is mounted on its side or upside down, turned upright."""
-
-    inner: ImageFormat
-    """The format in which the camera sends them."""
-    clockwise_deg: Literal[90, 180, 270]
-
-    def check(self, data: bytes) -> None:
-        """See ``ImageFormat``."""
-        self.inner.check(data)
-
-    def pixels(self, data: bytes) -> UInt8Array:
-        """See ``ImageFormat``: turned upright."""
-        return turned(self.inner.pixels(data), self.clockwise_deg)
-
-    def decode(self, data: bytes) -> UInt8Array:
-        """See ``ImageFormat``: turned upright."""
-        return turned(self.inner.decode(data), self.clockwise_deg)
-
-
-class SharedImage:
-    """One image of several cameras; decoded once, when the first part is needed."""
+class CapturedImage:
+    """One image of one camera or several; decoded once, when the first part is needed."""
 
     def __init__(self, image_format: ImageFormat) -> None:
         self._format = image_format
         self._pixels: UInt8Array | None = None
 
     def decoder(self, camera: CameraDeviceParameters) -> Decoder:
-        """The decoder of a camera's part; it returns a view of the whole image unless the part is turned."""
+        """The decoder of a camera's part, turned upright: a view of the whole image unless it is turned.
+
+        It raises CorruptImageError for a part without content too: see `plausible`.
+        """
         return partial(self._part, camera)
 
     def _part(self, camera: CameraDeviceParameters, data: bytes) -> UInt8Array:
-        assert camera.crop is not None
         if self._pixels is None:
             self._pixels = self._format.pixels(data)
-        left, top, width, height = (length // camera.reduce for length in camera.crop)
-        return turned(plausible(self._pixels[top : top + height, left : left + width]), camera.turn_deg)
+        part = self._pixels
+        if camera.crop is not None:
+            left, top, width, height = (length // camera.reduce for length in camera.crop)
+            part = part[top : top + height, left : left + width]
+        return turned(plausible(part), camera.turn_deg)
 
 
 def turned(image: UInt8Array, clockwise_deg: Literal[0, 90, 180, 270]) -> UInt8Array:

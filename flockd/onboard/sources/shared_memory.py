@@ -109,7 +109,7 @@ class SharedMemorySource(FrameReceiver):
             why = f"{camera}: a time stamp is not on this computer's clock; correct the program that sends it"
             self.refuse(camera, "time_stamp", why)
             return
-        self.offer(RawFrame(camera, sample.payload.to_bytes(), image_format.decode, time_s, sequence))
+        self.offer(RawFrame(camera, sample.payload.to_bytes(), image_format.pixels, time_s, sequence))
 
 
 def _open(*, listen: Sequence[str], connect: Sequence[str]) -> zenoh.Session:

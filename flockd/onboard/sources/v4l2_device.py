@@ -18,7 +18,7 @@ from flockd.core.choices import PixelFormat
 from flockd.core.config.source import CameraDeviceParameters, ControlParameters
 from flockd.onboard.sources import v4l2_kernel as v4l2
 from flockd.onboard.sources.frames import CameraDevice, CameraError, CapturedBuffer
-from flockd.onboard.sources.image_formats import ImageFormat, MjpegFormat, PackedFormat, TurnedFormat
+from flockd.onboard.sources.image_formats import ImageFormat, MjpegFormat, PackedFormat
 from flockd.onboard.sources.v4l2_kernel import Kernel
 
 CAPTURE = 1  # V4L2_BUF_TYPE_VIDEO_CAPTURE
@@ -43,13 +43,12 @@ class V4l2Device(CameraDevice):
     def __init__(self, camera: CameraDeviceParameters, size: tuple[int, int], kernel: Kernel | None = None) -> None:
         """Opens, sets up and starts the device. Raises CameraError if the driver does not grant a setting.
 
-        ``size``: width and height of the images as used, after `reduce` and `turn_deg`.
+        ``size``: width and height of the images as used, after `reduce` and before `turn_deg`.
         """
         self._kernel = kernel or Kernel()
         self._who = f"{camera.name}: {camera.device}"
-        width, height = size if camera.turn_deg % 180 == 0 else (size[1], size[0])
-        self._size = width * camera.reduce, height * camera.reduce
-        self._pixel_format, self._turn_deg, self._reduce = camera.pixel_format, camera.turn_deg, camera.reduce
+        self._size = size[0] * camera.reduce, size[1] * camera.reduce
+        self._pixel_format, self._reduce = camera.pixel_format, camera.reduce
         self._other_size = f", or write a smaller reduce than {camera.reduce}" if camera.reduce > 1 else ""
         self._other_size += ", or correct crop_of" if camera.crop else ""
         self._maps: list[mmap.mmap] = []
@@ -90,10 +89,9 @@ class V4l2Device(CameraDevice):
 
     def image_format(self) -> ImageFormat:
         """See ``CameraDevice``."""
-        sent: ImageFormat = PackedFormat("YUY2", self._size, self._bytes_per_line, self._reduce)
         if self._pixel_format == "mjpeg":
-            sent = MjpegFormat(self._size, self._reduce)
-        return sent if self._turn_deg == 0 else TurnedFormat(sent, self._turn_deg)
+            return MjpegFormat(self._size, self._reduce)
+        return PackedFormat("YUY2", self._size, self._bytes_per_line, self._reduce)
 
     def close(self) -> None:
         """See ``CameraDevice``."""

@@ -204,8 +204,6 @@ class _PngFormat:
             raise CorruptImageError(f"{shown} instead of {self.size[0]}x{self.size[1]}")
         return np.asarray(image, np.uint8)
 
-    decode = pixels
-
 
 def _states(bag: Bag, topic: str, config: DroneConfig, began_ns: int, tell: Callable[[str], None]) -> NearestState:
     """All states of the vehicle in the bag."""

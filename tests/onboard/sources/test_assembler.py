@@ -30,7 +30,7 @@ class Stage:
         number = self._sequence[camera] if sequence is None else sequence
         self._sequence[camera] = number + 1
         content = f"{camera} {time_s}".encode() if data is None else data
-        frame = RawFrame(camera, content, RgbFormat((32, 32)).decode, time_s, number)
+        frame = RawFrame(camera, content, RgbFormat((32, 32)).pixels, time_s, number)
         return self.assembler.offer(frame, self.now_s)
 
     def take(self) -> RawFrameSet | None:

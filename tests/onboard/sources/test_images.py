@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flockd.onboard.sources.image_formats import CorruptImageError, MjpegFormat, PackedFormat, RgbFormat
+from flockd.onboard.sources.image_formats import CorruptImageError, MjpegFormat, PackedFormat, RgbFormat, plausible
 from tests.onboard.sources.camera_images import SIZE, jpeg, scene
 
 
@@ -24,7 +24,7 @@ def test_a_jpeg_may_leave_out_the_tables_that_all_cameras_share_and_be_padded() 
     bare = _without_huffman_tables(whole)
     assert len(bare) < len(whole) - 400
     for padding in (bytes(513), b"\xff\xff\x55" * 171):  # whatever the driver's buffer held
-        np.testing.assert_array_equal(MjpegFormat(SIZE).decode(bare + padding), MjpegFormat(SIZE).decode(whole))
+        np.testing.assert_array_equal(MjpegFormat(SIZE).pixels(bare + padding), MjpegFormat(SIZE).pixels(whole))
 
 
 @pytest.mark.fault("damaged-images")
@@ -44,24 +44,24 @@ def test_a_jpeg_may_leave_out_the_tables_that_all_cameras_share_and_be_padded() 
 def test_a_damaged_jpeg_is_refused_with_a_reason(damage: object, reason: str) -> None:
     assert callable(damage)
     with pytest.raises(CorruptImageError, match=reason):
-        MjpegFormat(SIZE).decode(damage(jpeg(scene())))
+        plausible(MjpegFormat(SIZE).pixels(damage(jpeg(scene()))))
 
 
 def test_a_white_sky_and_a_black_ground_are_no_damage() -> None:
     image = scene()
     image[:200] = 255
     image[400:] = 0
-    assert MjpegFormat(SIZE).decode(jpeg(image)).shape == (480, 640, 3)
+    assert plausible(MjpegFormat(SIZE).pixels(jpeg(image))).shape == (480, 640, 3)
 
 
 def test_whole_pixels_are_reduced_to_their_mean() -> None:
     pixels = np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)
-    reduced = PackedFormat("RGB", (64, 48), reduce=2).decode(pixels.tobytes())
+    reduced = PackedFormat("RGB", (64, 48), reduce=2).pixels(pixels.tobytes())
     np.testing.assert_allclose(reduced, pixels.reshape(24, 2, 32, 2, 3).mean(axis=(1, 3)), atol=1.0)
 
 
 def test_plain_rgb_is_handed_on_as_it_is_even_if_it_shows_nothing() -> None:
     for image in (scene(), np.zeros((480, 640, 3), np.uint8)):
-        np.testing.assert_array_equal(RgbFormat(SIZE).decode(image.tobytes()), image)
+        np.testing.assert_array_equal(RgbFormat(SIZE).pixels(image.tobytes()), image)
     with pytest.raises(CorruptImageError, match="921599 bytes instead of 921600"):
-        RgbFormat(SIZE).decode(scene().tobytes()[:-1])
+        RgbFormat(SIZE).pixels(scene().tobytes()[:-1])
