@@ -35,8 +35,8 @@ ACCEPTANCE = EgoMotionAcceptance()
 def estimate_ego_motion(pairs: PointPairs, rig: Rig, interval_s: float, parameters: GeometryParameters) -> EgoMotion:
     """``P_C = R_FC P_F + T_FC`` (Eq. 7) from the background pairs of all cameras together.
 
-    By Algorithm 1. With ``parameters.refine`` its reprojection error is then minimised; if that fails or loses matches,
-    the result of Algorithm 1 is kept. ``inliers`` and ``threshold_m`` are Algorithm 1's. Raises ValueError with the
+    By Algorithm 1. With ``parameters.refine`` its reprojection error is then minimised; if that loses matches, the
+    result of Algorithm 1 is kept. ``inliers`` and ``threshold_m`` are Algorithm 1's. Raises ValueError with the
     reason if there is no estimate, or if it explains too few of its matches.
     """
     found = ransac_rigid(
@@ -52,8 +52,8 @@ def estimate_ego_motion(pairs: PointPairs, rig: Rig, interval_s: float, paramete
     explained = _explained(by_camera, motion) / len(pairs)
     if parameters.refine:
         refined = refine_ego_motion(pairs, rig, motion, found.inliers)
-        still = _explained(by_camera, refined) / len(pairs) if refined else 0.0
-        if refined and still >= ACCEPTANCE.min_kept * explained:
+        still = _explained(by_camera, refined) / len(pairs)
+        if still >= ACCEPTANCE.min_kept * explained:
             motion, explained = refined, still
     if explained < ACCEPTANCE.min_explained:
         raise ValueError(

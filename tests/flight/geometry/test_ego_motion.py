@@ -13,12 +13,10 @@ from flockd.flight.geometry import (
     PointPairs,
     RigidTransform,
     ego_motion,
-    ego_motion_refinement,
     estimate_ego_motion,
     rotation_angle_deg,
     rotation_from_euler,
 )
-from flockd.flight.geometry.ego_motion_refinement import refine_ego_motion
 
 from .synthetic_world import EXACT, Flaws, boxes_around, four_camera_rig, seen_twice
 
@@ -77,20 +75,11 @@ def test_the_polish_is_several_times_closer_than_algorithm_1(flaws: Flaws, limit
     assert np.all(np.median(polished, axis=0) < np.median(raw, axis=0) / 1.5)
 
 
-@pytest.mark.parametrize("rises", [True, False])
-def test_a_polish_that_costs_more_than_its_start_is_refused(monkeypatch: pytest.MonkeyPatch, rises: bool) -> None:
-    pairs, truth = flight(2, Flaws())
-    costs = iter([2.0, 1.0] if rises else [1.0, 2.0])  # of the polished motion, then of the start
-    monkeypatch.setattr(ego_motion_refinement._Weighting, "loss", lambda *_: next(costs))
-    assert (refine_ego_motion(pairs, RIG, truth, np.ones(len(pairs), np.bool_)) is None) == rises
-
-
-@pytest.mark.parametrize("polished", ["refused", "leaves the matches behind"])
-def test_a_polish_that_is_no_better_leaves_algorithm_1s_result(monkeypatch: pytest.MonkeyPatch, polished: str) -> None:
+def test_a_polish_that_leaves_the_matches_behind_leaves_algorithm_1s_result(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its robust cost falls where most matches are false, and it explains the others."""
     pairs, truth = flight(6, EXACT)
     astray = RigidTransform(rotation_from_euler(0.0, 0.0, 0.03), np.zeros(3)) @ truth
-    monkeypatch.setattr(ego_motion, "refine_ego_motion", lambda *_, **__: None if polished == "refused" else astray)
+    monkeypatch.setattr(ego_motion, "refine_ego_motion", lambda *_: astray)
     raw, kept = (estimate_ego_motion(pairs, RIG, 0.5, parameters) for parameters in (UNPOLISHED, POLISHED))
     assert np.array_equal(raw.rotation, kept.rotation)
     assert np.array_equal(raw.translation, kept.translation)
