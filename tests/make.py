@@ -35,6 +35,7 @@ from flockd.flight.geometry import PinholeCamera, RigCamera, RigidTransform, log
 from flockd.flight.safety import OFFBOARD, Action, CameraHealth, Inputs, Permission, Request, Surroundings
 from flockd.onboard.autopilot.autopilot_status import AutopilotStatus
 from flockd.onboard.telemetry.topics import FlightMessage
+from flockd.sim.flock.start import with_drones
 from flockd.sim.scenario import ScenarioConfig, load_scenario
 
 Section = TypeVar("Section", bound=BaseModel)
@@ -168,9 +169,12 @@ def drone(*cameras: CameraConfig, **sections: Any) -> DroneConfig:
     return DroneConfig(rig=RigConfig(cameras=cameras or (camera(),)), **sections)
 
 
-def scenario(overrides: Mapping[str, Any] | None = None, name: str = "paper_flight") -> ScenarioConfig:
-    """A shipped one, with single values set over the file's by dotted key."""
-    return load_scenario(data_path("config") / f"{name}.yaml", dict(overrides or {}))
+def scenario(
+    overrides: Mapping[str, Any] | None = None, name: str = "paper_flight", drones: int | None = None
+) -> ScenarioConfig:
+    """A shipped one, with single values set over the file's by dotted key, and with so many drones."""
+    flight = load_scenario(data_path("config") / f"{name}.yaml", dict(overrides or {}))
+    return flight if drones is None else with_drones(flight, drones)
 
 
 def small_eyes(flight: ScenarioConfig, every: int = 2) -> ScenarioConfig:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,14 +19,15 @@ from flockd.flight.perception import Observation
 from flockd.flight.perception.observation import CameraObservation
 from flockd.flight.pilot import StepTrace
 from flockd.onboard.recording import Recorder
-from flockd.onboard.recording.mcap_file import Note, Record
+from flockd.onboard.recording.mcap_file import Damage, Entry, McapFile, read_records
 from flockd.onboard.recording.reader import Recording
+from flockd.onboard.recording.streams import OUTPUT, TRUTH
 from flockd.onboard.recording.truth import TrueDrone, Truth
 from flockd.review.flight_log.from_recordings import flight_log, key_frames, recordings_in
 from flockd.review.flight_log.log import FlightLog
 from flockd.review.report.summary import summarise
 from tests import make
-from tests.onboard.recording.made_up import HEIGHT, MODELS, WIDTH, MadeUpPilot, drone_config, rewritten
+from tests.onboard.recording.made_up import HEIGHT, MODELS, WIDTH, MadeUpPilot, drone_config, with_facts
 
 NAMES = ("drone1", "drone2")
 STEPS, STEP_S = 12, 0.5
@@ -191,11 +191,16 @@ def test_the_report_of_a_folder_lies_beside_it_and_stays_unless_it_is_forced(
 
 
 def test_a_step_in_which_the_recorder_was_killed_does_not_count(flight: Path, tmp_path: Path, capsys: Capture) -> None:
-    whole = (flight / "drone1.mcap").read_bytes()
     path = tmp_path / "drone1.mcap"
-    lengths = np.linspace(len(whole) // 3, 4 * len(whole) // 5, 12).astype(int)
-    steps = []
-    for length in lengths:
+    with McapFile(path) as file:
+        for found in read_records(flight / "drone1.mcap"):
+            assert not isinstance(found, Damage)
+            if not (isinstance(found, Entry) and found.sequence == STEPS - 1 and found.stream in {TRUTH, OUTPUT}):
+                file.write(found)
+    log = log_of(path)
+    assert (log.has_truth, len(log.time_s)) == (True, STEPS - 1), "of the last one truth and output are missing"
+    whole, steps = (flight / "drone1.mcap").read_bytes(), []
+    for length in np.linspace(len(whole) // 3, 4 * len(whole) // 5, 6).astype(int):
         path.write_bytes(whole[:length])
         log = log_of(path)
         assert log.has_truth
@@ -289,9 +294,7 @@ def test_of_several_flights_of_a_drone_the_newest_is_told_and_an_earlier_report_
     folder.mkdir()
     for name, began in (("kite-2", "2026-11-24T09:30:00+00:00"), ("kite-1", "2026-11-24T10:00:00+00:00")):
         record_flight(tmp_path / "draft.mcap", name="kite", with_truth=False)
-        rewritten(
-            tmp_path / "draft.mcap", folder / f"{name}.mcap", partial(begun, began=began, flight_number=name[-1:])
-        )
+        with_facts(tmp_path / "draft.mcap", folder / f"{name}.mcap", began=began, flight_number=name[-1:])
     out, err = told(capsys, 0, folder, "--without-pictures")
     page = folder / "kite-2.report" / "report.html"
     assert out.splitlines()[-1] == f"report: {page}"
@@ -306,12 +309,6 @@ def test_of_several_flights_of_a_drone_the_newest_is_told_and_an_earlier_report_
     told(capsys, 0, folder, "--without-pictures", "--force")
     told(capsys, 0, folder / "kite-1.mcap", "--without-pictures")
     assert "begun 2026-11-24 10:00 UTC" in text_of(folder / "kite-1.report" / "report.html")
-
-
-def begun(record: Record, **facts: str) -> Record:
-    if isinstance(record, Note) and record.name == "flockd":
-        return Note(record.name, {**record.facts, **facts})
-    return record
 
 
 @pytest.mark.parametrize(

@@ -13,14 +13,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from flockd.core.data import data_path
 from flockd.core.messages import SizeStatus
 from flockd.review.flight_log.builder import FlightLogBuilder, match_neighbours
 from flockd.review.flight_log.log import FlightLog
-from flockd.review.flight_log.metadata import FlightMetadata, HandedOver, LearnedSize, MissionMetadata
+from flockd.review.flight_log.metadata import FleetMetadata, FlightMetadata, HandedOver, LearnedSize, MissionMetadata
 from flockd.review.report.page_texts import page_texts
 from flockd.review.report.summary import causes_text, sizes_text, summarise
-from flockd.sim.scenario import load_scenario
 from tests import make
 
 Array = NDArray[np.float64]
@@ -41,7 +39,7 @@ def _turn(axis: str, degrees: float) -> Array:
 
 def flight_metadata(**changes: Any) -> FlightMetadata:
     """Of the hand-made flight, but for the changes."""
-    drone = load_scenario(data_path("config") / "paper_flight.yaml").drone
+    drone = make.scenario().drone
     facts = {
         "scenario": "side_by_side", "perception": "learned", "flow": "dis", "drones": DRONES, "duration_s": 15.0,
         "seed": 3, "wall_s": 60.0, "circle_until_s": 2.0,
@@ -110,18 +108,6 @@ def _first(log: FlightLog, steps: int) -> FlightLog:
         name: getattr(log, name)[:steps] for name in log.__dataclass_fields__ if name not in ("stages_ms", "metadata")
     }
     return replace(log, **cut, metadata=log.metadata.model_copy(update={"duration_s": 0.5 * steps}))
-
-
-def test_the_flights_own_facts_are_carried_over() -> None:
-    summary = summarise(_hand_made())
-    facts = {key: summary[key] for key in ("scenario", "perception", "flow", "scale", "drones", "seed")}
-    assert facts == {
-        "scenario": "side_by_side", "perception": "learned", "flow": "dis", "scale": "height", "drones": 2, "seed": 3,
-    }  # fmt: skip
-    assert (summary["duration_s"], summary["step_s"], summary["wall_s"]) == (15.0, 0.5, 60.0)
-    assert summary["realtime_factor"] == 0.25
-    assert json.loads(json.dumps(summary, allow_nan=False)) == summary, "strict JSON"
-    assert summary["stages_ms"] == {"flow": {"p50": 51.0, "p95": 96.0}}
 
 
 def test_table_2_by_hand() -> None:
@@ -263,23 +249,6 @@ def test_what_a_short_flight_cannot_tell_is_null(steps: int) -> None:
     json.dumps(summary, allow_nan=False)
 
 
-def test_a_single_drone_has_no_distances() -> None:
-    log = _hand_made()
-    alone: dict[str, Any] = {"tracked": log.tracked[:0]}
-    shared = ("time_s", "desired", "goal", "obstacles", "stages_ms", "metadata", *alone)
-    for name in log.__dataclass_fields__:
-        value = getattr(log, name)
-        if name in ("neighbour_position", "neighbour_velocity"):
-            alone[name] = value[:, :1, :1]
-        elif name not in shared:
-            alone[name] = value[:, :1]
-    summary = summarise(replace(log, **alone, metadata=log.metadata.model_copy(update={"drones": 1})))
-    assert summary["flock"]["min_distance_m"] is None
-    assert summary["flock"]["safety"] == 1.0
-    assert summary["neighbours"]["recall_within_10m"] is None
-    json.dumps(summary, allow_nan=False)
-
-
 def test_a_log_survives_its_file(tmp_path: Path) -> None:
     log = _hand_made()
     path = tmp_path / "flight.npz"
@@ -291,7 +260,23 @@ def test_a_log_survives_its_file(tmp_path: Path) -> None:
     for name in log.__dataclass_fields__:
         if name not in ("stages_ms", "metadata"):
             np.testing.assert_array_equal(getattr(loaded, name), getattr(log, name))
-    assert summarise(loaded) == summarise(log)
+    summary = summarise(loaded)
+    assert summary == summarise(log) == json.loads(json.dumps(summary, allow_nan=False)), "strict JSON"
+    assert (summary["realtime_factor"], summary["stages_ms"]) == (0.25, {"flow": {"p50": 51.0, "p95": 96.0}})
+
+
+def test_metadata_of_a_fleet_comes_back() -> None:
+    fleet = FleetMetadata(
+        speed_factor=0.5, frame_sets=4, longest_step_s=1.0, order_last_20s=math.nan,
+        handed_over={"drone1": "it landed"}, exit_codes={"drone1": 0}, notes=["a note"],
+    )  # fmt: skip
+    written = flight_metadata(fleet=fleet, seed=None).model_dump_json(exclude_unset=True)
+    assert json.loads(written)["seed"] is None
+    assert "recorded" not in json.loads(written)
+    again = FlightMetadata.model_validate_json(written).fleet
+    assert again is not None
+    assert math.isnan(again.order_last_20s)
+    assert again.handed_over == {"drone1": "it landed"}
 
 
 def test_a_log_refuses_what_does_not_fit(tmp_path: Path) -> None:
@@ -349,9 +334,9 @@ def test_a_mission_has_arrived_where_the_middle_is_at_the_last_goal() -> None:
 
 def test_where_a_person_leads_it_is_the_persons_drone_that_arrives() -> None:
     """The first drone is at the goal at the end, the flock's middle 2 m beside it."""
-    scenario = load_scenario(data_path("config") / "led_by_hand.yaml")
+    scenario = make.scenario(name="led_by_hand")
     assert MissionMetadata.of(scenario.missions).led_by == 0
-    knowing = load_scenario(data_path("config") / "one_knows.yaml")
+    knowing = make.scenario(name="one_knows")
     assert MissionMetadata.of(knowing.missions).led_by is None
     log = _hand_made()
     goal = np.tile(log.position[-1, 0, :2] + [0.1, 0.0], (STEPS, 1))

@@ -18,7 +18,6 @@ from flockd.flight.geometry import build_rig
 from flockd.sim.cameras.camera_simulator import CameraSimulator
 from flockd.sim.cameras.imperfect_cameras import CamerasConfig
 from flockd.sim.cameras.lens_views import lens_view
-from flockd.sim.renderer.renderer import Renderer
 from flockd.sim.scenario import CameraFaultConfig, ScenarioConfig, load_scenario
 from flockd.sim.vehicles.vehicles import Vehicles
 
@@ -55,27 +54,17 @@ def images(frames: list[dict[str, Frame]]) -> list[Any]:
     return [{name: frame.image.tolist() for name, frame in step.items()} for step in frames]
 
 
-def test_without_cameras_and_with_ideal_ones_an_image_is_the_view_as_it_is_drawn(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_without_cameras_and_with_ideal_ones_an_image_is_the_view_as_it_is_drawn() -> None:
     """Drawn here once more by the renderer alone."""
     scenario = scenario_with(None, image_noise=0.0)
-    made: list[Renderer] = []
-    renderer_of = Renderer
-
-    def kept(*parts: Any) -> Renderer:
-        made.append(renderer_of(*parts))
-        return made[-1]
-
-    monkeypatch.setattr("flockd.sim.cameras.camera_simulator.Renderer", kept)
-    frames = flown_frames(scenario, steps=1)[0]
-    vehicles = Vehicles(scenario.vehicles, scenario.vehicle)
+    simulator, vehicles = CameraSimulator(scenario, 0), Vehicles(scenario.vehicles, scenario.vehicle)
+    frames = simulator.capture(0, 0, 0.0, vehicles, vehicles.trail).frames
     for name, mounted in build_rig(scenario.drone.rig).cameras.items():
         turn = vehicles.R_ned_body[0] @ mounted.T_body_camera.rotation
         place = vehicles.position[0] + vehicles.R_ned_body[0] @ mounted.T_body_camera.translation
         drawn = lens_view(
             mounted.camera,
-            lambda matrix, size, part, turn=turn, place=place: made[0].render(  # type: ignore[misc]
+            lambda matrix, size, part, turn=turn, place=place: simulator._renderer.render(  # type: ignore[misc]
                 matrix, size, turn @ part, place,
                 drone_rotations=vehicles.R_ned_body, drone_positions=vehicles.position, shown=[1],
             ),

@@ -6,10 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from flockd.core.data import data_path
 from flockd.core.messages import UInt8Array
 from flockd.sim.flock.flight_film import FlightFilm, seen_from_above
-from flockd.sim.scenario import load_scenario
+from tests import make
 
 PLACES = np.array([[0.0, 0.0, -5.0], [3.0, 0.0, -5.0], [0.0, 4.0, -9.0]])
 
@@ -29,7 +28,7 @@ def test_north_is_up_and_east_is_right_of_the_flock_s_middle() -> None:
 def test_a_drone_that_was_taken_out_is_not_drawn_and_another_flight_begins_without_trails() -> None:
     images: list[UInt8Array] = []
     picture = cv2.imencode(".jpg", np.full((320, 240, 3), 200, np.uint8))[1].tobytes()
-    scenario = load_scenario(data_path("config") / "paper_flight.yaml", {})
+    scenario = make.scenario()
     film = FlightFilm(scenario, lambda camera: picture if camera == "front" else None, images.append)
     film.add(0.0, PLACES)
     film.add(0.5, 1.5 * PLACES)

@@ -9,11 +9,10 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
-from flockd.core.data import data_path
 from flockd.sim.flock.flock_telemetry import Repeater
-from flockd.sim.flock.start import with_drones
 from flockd.sim.flock.swarm import fly
-from flockd.sim.scenario import ScenarioConfig, load_scenario
+from flockd.sim.scenario import ScenarioConfig
+from tests import make
 from tests.sim.flock.watching import Watching
 
 SECONDS_TO_FAIL = 120.0
@@ -21,7 +20,7 @@ SECONDS_TO_FAIL = 120.0
 
 def scenario(duration_s: float) -> ScenarioConfig:
     overrides = {"duration_s": duration_s, "ideal": True, "drone.safety.gate.fence_radius_m": 30.0}
-    return with_drones(load_scenario(data_path("config") / "paper_flight.yaml", overrides), 2)
+    return make.scenario(overrides, drones=2)
 
 
 def test_a_flock_on_exact_states_is_seen_and_goes_where_it_is_sent(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,17 +9,16 @@ import time
 
 import pytest
 
-from flockd.core.data import data_path
 from flockd.sim.flock.live_flight import LiveControls
-from flockd.sim.flock.start import with_drones
-from flockd.sim.scenario import ScenarioConfig, load_scenario
+from flockd.sim.scenario import ScenarioConfig
 from flockd.sim.vehicles.vehicles import UNDISTURBED, Disturbances, Vehicles
+from tests import make
 
 IDENTITY = "51m"
 
 
 def scenario() -> ScenarioConfig:
-    return with_drones(load_scenario(data_path("config") / "paper_flight.yaml"), 3)
+    return make.scenario(drones=3)
 
 
 class Bench:
@@ -117,7 +116,6 @@ def test_cameras_are_switched_off_and_on_and_drones_removed() -> None:
         ("explode", None, "the simulation's controls are pause, go_on"),
         ("speed", {"factor": 0}, "factor has to be a number from 0.05 to 20"),
         ("speed", {"factor": True}, "factor has to be a number"),
-        ("speed", {"factor": "2"}, "factor has to be a number"),
         ("gusts", {"gust_m_s": 3.5}, "gust_m_s has to be a number from 0 to 3"),
         ("gusts", None, "gust_m_s has to be a number from 0 to 3"),
         ("camera", {"drone": "drone1", "camera": "front"}, "camera needs `works`"),

@@ -4,14 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from flockd.core.config import Overrides
-from flockd.core.data import data_path
 from flockd.sim.flock.live_flight import LiveControls, fly_live
-from flockd.sim.flock.start import with_drones
 from flockd.sim.flock.swarm import eyes_of
-from flockd.sim.scenario import load_scenario
 from flockd.sim.vehicles.vehicles import UNDISTURBED, Disturbances
-from tests.make import small_eyes
+from tests import make
 from tests.sim.flock.watching import Watching
 
 STEPS = 2
@@ -41,8 +37,8 @@ class ThreeFlights(LiveControls):
 
 
 def test_a_flight_begun_again_is_the_same_and_a_camera_that_is_off_shows_nothing() -> None:
-    overrides: Overrides = {"duration_s": 5.0, "seed": 5, "drone.perception.flow": "dis"}
-    flown = small_eyes(with_drones(load_scenario(data_path("config") / "paper_flight.yaml", overrides), 2))
+    overrides = {"duration_s": 5.0, "seed": 5, "drone.perception.flow": "dis"}
+    flown = make.small_eyes(make.scenario(overrides, drones=2))
     watching, controls = Watching(), ThreeFlights(flown, "f10c", by_sight=True)
     controls.seen = watching
     with pytest.raises(KeyboardInterrupt):

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from itertools import combinations
-from pathlib import Path
 
 import pytest
 
 from flockd.sim.flock.start import with_drones
-from flockd.sim.scenario import load_scenario
+from tests import make
 
-PAPER = load_scenario(Path(__file__).parents[3] / "config" / "paper_flight.yaml")
+PAPER = make.scenario()
 
 
 def test_a_smaller_flock_is_the_first_of_the_list() -> None:

@@ -9,30 +9,27 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flockd.core.config import Overrides
-from flockd.core.data import data_path
 from flockd.core.messages import FrameSet, VehicleState
 from flockd.flight.pilot import FlockPilot
 from flockd.onboard.telemetry import TelemetrySink
 from flockd.onboard.telemetry.publisher import ZenohTelemetry
 from flockd.review.flight_log.log import FlightLog
 from flockd.review.report.summary import summarise
-from flockd.sim.flock.start import with_drones
 from flockd.sim.flock.swarm import Flight, fly
-from flockd.sim.scenario import ScenarioConfig, load_scenario
+from flockd.sim.scenario import ScenarioConfig
 from flockd.sim.sitl.processes import free_endpoint
-from tests.make import small_eyes
+from tests import make
 from tests.sim.flock.watching import Watching
 
 STEPS = 3
 
 
 def scenario(duration_s: float = 0.5 * STEPS, height: str = "best", *, ideal: bool = False) -> ScenarioConfig:
-    overrides: Overrides = {
+    overrides = {
         "duration_s": duration_s, "seed": 5, "drone.perception.flow": "dis", "drone.perception.height": height,
         "ideal": ideal,
     }  # fmt: skip
-    return small_eyes(with_drones(load_scenario(data_path("config") / "paper_flight.yaml", overrides), 2))
+    return make.small_eyes(make.scenario(overrides, drones=2))
 
 
 def flown(telemetry: TelemetrySink) -> FlightLog:
@@ -160,7 +157,7 @@ def test_an_interrupted_flight_is_what_was_flown() -> None:
 def test_twenty_seconds_from_pixels() -> None:
     """Seed 0: 1.80 m, 0.978, 0.929 (confirmation takes time), no false one. Of a flock that sees nobody, two come
     within 0.53 m."""
-    summary = summarise(fly(load_scenario(data_path("config") / "paper_flight.yaml", {"duration_s": 20.0})).log)
+    summary = summarise(fly(make.scenario({"duration_s": 20.0})).log)
     assert summary["flock"]["min_distance_after_10s_m"] >= 1.5
     assert summary["flock"]["order_tail"] >= 0.95
     assert summary["flock"]["union_tail"] == 1.0

@@ -5,12 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from flockd.core.config.document import Value
-from flockd.core.data import data_path
 from flockd.core.messages import FloatArray
 from flockd.review.flight_log.log import FlightLog
 from flockd.sim.flock.swarm import fly
-from flockd.sim.scenario import load_scenario
+from tests import make
 
 
 def range_errors(log: FlightLog, drone: int, since_s: float, until_s: float) -> FloatArray:
@@ -28,10 +26,8 @@ def range_errors(log: FlightLog, drone: int, since_s: float, until_s: float) -> 
 @pytest.mark.parametrize("family", [12, 13])
 def test_a_size_that_no_network_knows_is_found_in_twenty_seconds(family: int) -> None:
     """By the first that weaves; its ranges are right from then on."""
-    overrides: dict[str, Value] = {"duration_s": 20.0, "world.drone_family": family, "drone.flocking.size": "learn"}
-    scenario = load_scenario(data_path("config") / "paper_flight.yaml", overrides)
-    three = scenario.model_copy(update={"vehicles": scenario.vehicles[:3]})
-    log = fly(three, pictured=False).log
+    overrides = {"duration_s": 20.0, "world.drone_family": family, "drone.flocking.size": "learn"}
+    log = fly(make.scenario(overrides, drones=3), pictured=False).log
     sizes = log.metadata.sizes
     drone = min(sizes, key=lambda one: sizes[one].since_s)
     since_s = sizes[drone].since_s

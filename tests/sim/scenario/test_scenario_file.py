@@ -92,7 +92,6 @@ def test_the_schema_describes_the_file_and_not_the_merged_model() -> None:
     assert DroneConfig.model_json_schema()["required"] == ["rig"]
 
 
-TREES = "world: {obstacles: {trees_per_hectare"
 FLIGHTS = (
     ("[0, 0, -4]", "[0, 0, 4.5]", "4: vehicles[0].position_m: the third number points down"),
     ("[0, 0, -4]", "[0, 0, -0.2]", "4: vehicles[0].position_m: begins 0.2 m above the ground"),
@@ -105,23 +104,16 @@ FLIGHTS = (
         "- {position_m: [0, 5, -4], by_hand: true}\nfaults: [{drone: 2, camera: front}]",
         "6: faults[0].drone: is 2, which is flown by hand; write one of flockd's",
     ),
-    ("[0, 0, -4]", "[473977400, 0, -4]", "4: vehicles[0].position_m[0]: 473977400 is not at most 100000"),
-    ("[0, 0, -4]}", "[0, 0, -4], velocity_m_s: [1000, 0]}", "4: vehicles[0].velocity_m_s[0]: 1000 is not at most 50"),
     ("", "sensors: {range_finder: {min_m: 30}}", "2: sensors.range_finder.min_m: 30 is not below max_m 20; write a"),
     ("", "detections: {false_m: [20, 10, 5]}", "2: detections.false_m: falls; write the 10th, the 50th and the 90th"),
-    ("", "world: {ground_relief_m: 50}", "2: world.ground_relief_m: 50 is not at most 2"),
-    ("", "world: {clearance_m: 5000}", "2: world.clearance_m: 5000 is not at most 100"),
     ("", "world: {drone_family: 99}", "2: world.drone_family: 99 is not at most 13; write a whole number from 0 to"),
     ("", "world:\n  obstacles:\n    kind: jungle", "4: world.obstacles.kind: jungle is not known; write `forest` or"),
-    ("", TREES + ": 900, kind: forest}}", "2: world.obstacles.trees_per_hectare: 900 is not at most 400"),
-    ("", TREES + ": 100, kind: village}}", "2: world.obstacles.trees_per_hectare: has no meaning with kind `village`"),
-    ("", "duration_s: 0.1", "2: duration_s: 0.1 s is shorter than a step of 0.5 s"),
-    ("", "duration_s: 1e6", "2: duration_s: 1e6 is not at most 86400"),
     (
-        "  - {position_m: [0, 0, -4]}\n",
-        "".join(f"  - {{position_m: [{north}, 0, -4]}}\n" for north in range(5000)),
-        "3: vehicles: has 5001 entries",
+        "",
+        "world: {obstacles: {trees_per_hectare: 100, kind: village}}",
+        "2: world.obstacles.trees_per_hectare: has no meaning with kind `village`",
     ),
+    ("", "duration_s: 0.1", "2: duration_s: 0.1 s is shorter than a step of 0.5 s"),
 )
 
 

@@ -6,10 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from flockd.core.data import data_path
-from flockd.sim.scenario import load_scenario
 from flockd.sim.sitl.fleet_log import FleetRun, fleet_log
 from flockd.sim.sitl.ground_station import Poses
+from tests import make
 from tests.onboard.recording.made_up import drone_config, record
 
 
@@ -25,9 +24,7 @@ def test_a_motion_over_a_skipped_frame_set_is_not_in_the_log(tmp_path: Path) -> 
     assert outputs[-1].mission.takeover is not None
     run.handed_over = {config.name: "after 3 s its mission was over", "drone9": "after 2 s its battery was"}
     run.modes = {config.name: ["OFFBOARD", "LAND"]}
-    scenario = load_scenario(data_path("config") / "paper_flight.yaml")
-    scenario = scenario.model_copy(update={"vehicles": scenario.vehicles[:1]})
-    log = fleet_log(scenario, [config], run, tmp_path, 0.5)
+    log = fleet_log(make.scenario(drones=1), [config], run, tmp_path, 0.5)
     np.testing.assert_allclose(log.time_s, np.array(times) - times[0])
     assert log.recorded[:, 0].tolist() == [True, True, False, True, True]
     assert np.isfinite(log.ego_translation[:, 0, 0]).tolist() == [True, True, False, False, True]

@@ -11,13 +11,11 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import development as mavlink
 
-from flockd.core.data import data_path
-from flockd.sim.flock.start import with_drones
-from flockd.sim.scenario import load_scenario
 from flockd.sim.sitl import fleet as fleet_module
 from flockd.sim.sitl.fleet import _Fleet
 from flockd.sim.sitl.fleet_log import FleetRun
 from flockd.sim.sitl.ground_station import _update, _Vehicle
+from tests import make
 
 
 @dataclass
@@ -50,7 +48,7 @@ class _World:
             self.armed[i] = False
 
     def fleet(self) -> _Fleet:
-        scenario = with_drones(load_scenario(data_path("config") / "paper_flight.yaml"), 2)
+        scenario = make.scenario(drones=2)
         height_m = np.array([-vehicle.position_m[2] for vehicle in scenario.vehicles])
         station = SimpleNamespace(
             mode_is=lambda i, mode: self.modes[i] == mode,
