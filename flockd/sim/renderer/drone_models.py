@@ -14,8 +14,6 @@ from flockd.sim.renderer.airframe import BLACK, Airframe, DroneModel, outline, o
 
 def drone_model(family: int, seed: int) -> DroneModel:
     """The mesh of a family (0 to ``FAMILIES`` - 1), colours and propeller angles from ``seed``."""
-    if not 0 <= family < FAMILIES:
-        raise ValueError(f"family must be from 0 to {FAMILIES - 1}, not {family}")
     craft = Airframe(np.random.default_rng([family, seed]))
     _BUILDERS[family](craft)
     return craft.model(family, seed)

@@ -22,8 +22,6 @@ from flockd.sim.world.world import GROUND, World
 
 Indices = NDArray[np.int32]
 Pair = tuple[FloatArray, FloatArray]
-_MOST_DRONES = 254
-"""Their ids are bytes."""
 _CORNERS = np.array([(a, b, c) for a in (-1, 1) for b in (-1, 1) for c in (-0.4, 0.4)])
 
 
@@ -43,8 +41,7 @@ class Renderer:
     """Draws one world and one flock from any camera. Holds no state that changes between images."""
 
     def __init__(self, world: World, drones: Sequence[Solid]) -> None:
-        if len(drones) > _MOST_DRONES:
-            raise ValueError(f"ids are bytes: at most {_MOST_DRONES} drones, not {len(drones)}")
+        """``drones``: 254 at most, as their ids are bytes."""
         self._world = world
         self._drones = tuple(drones)
         self._machine = machine_texels()
@@ -65,18 +62,13 @@ class Renderer:
         ``matrix`` (3, 3) is the pinhole K for pixel centres at +0.5, ``size`` (width, height), ``R_ned_camera`` (3, 3)
         takes optical RDF axes to NED, ``position_ned`` (3,) m. ``drone_rotations`` (n, 3, 3) are R_ned_body and
         ``drone_positions`` (n, 3) NED m, one of each drone of the constructor. ``shown``: a mask (n,) or indices; the
-        others are not seen, but every drone with a finite position casts its shadow. Poses of another number than the
-        drones raise ``ValueError``.
+        others are not seen, but every drone with a finite position casts its shadow.
         """
         world = self._world
         width, height = size
         count = len(self._drones)
         rotations = np.asarray(drone_rotations, dtype=np.float64).reshape(-1, 3, 3)
         positions = np.asarray(drone_positions, dtype=np.float64).reshape(-1, 3)
-        if len(rotations) != count or len(positions) != count:
-            raise ValueError(
-                f"{count} drones need {count} poses, not {len(rotations)} rotations and {len(positions)} positions"
-            )
         K, R, origin = (np.ascontiguousarray(one, dtype=np.float64) for one in (matrix, R_ned_camera, position_ned))
         eye = Eye(K, np.asarray(np.linalg.inv(K)), R, origin, float(np.sqrt(K[0, 0] * K[1, 1])))
         P = np.ascontiguousarray(K @ R.T)

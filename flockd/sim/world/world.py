@@ -27,7 +27,6 @@ GROUND = -1
 class World:
     """Everything that does not move. Arrays are never changed after generation."""
 
-    seed: int
     extent_m: float
     """Objects stand within this distance of the origin, north and east."""
     vertices: FloatArray
@@ -93,7 +92,6 @@ class World:
         kind_count = scenery.ground_kinds
         tiles_per_m = 1.0 / rng.uniform(2.2, 4.5, kind_count)
         return World(
-            seed=seed,
             extent_m=extent_m,
             vertices=vertices,
             triangles=triangles,
