@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import re
-import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,11 +18,9 @@ from flockd.core.config import load_drone
 from flockd.core.messages import Frame, FrameSet, UInt8Array
 from flockd.ground.calibration.board import BoardFinder, BoardSpec
 from flockd.onboard.sources import CameraStatus
-from flockd.onboard.sources.device_source import Devices
 from tests.conftest import Told
 from tests.ground.calibration import darkroom
 from tests.ground.calibration.darkroom import PINHOLE, facing, photograph
-from tests.onboard.sources.fake_kernel import FakeCamera, FakeKernel
 
 Capture = pytest.CaptureFixture[str]
 
@@ -163,31 +159,6 @@ def test_before_a_live_camera_a_person_gets_instructions(
     measured = load_drone(out).rig.cameras[0].intrinsics.measured
     assert measured is not None
     assert measured.camera == "/dev/video7"
-
-
-def test_a_v4l2_camera_is_read(tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
-    kernel = FakeKernel(video7=FakeCamera(formats=((480, 360, b"MJPG"),)))
-    monkeypatch.setattr("flockd.onboard.sources.Devices", lambda lenses: Devices(kernel, lenses=lenses))
-    monkeypatch.setattr("flockd.ground.calibration.image_sources.FIRST_FRAME_S", 60.0)
-    monkeypatch.setattr("flockd.ground.calibration.image_sources.MOST_S", 3.0)
-    done = threading.Event()
-
-    def film() -> None:
-        rng = np.random.default_rng(1)
-        while not done.is_set():
-            image = rng.integers(0, 255, (360, 480, 3), dtype=np.uint8)
-            with contextlib.suppress(AssertionError):  # not streaming yet, or no more
-                kernel.send("video7", bytes(cv2.imencode(".jpg", image)[1]), wait_s=0.1)
-            done.wait(0.02)
-
-    thread = threading.Thread(target=film)
-    thread.start()
-    command = ("calibrate", "camera", "--config", plugged_in(tmp_path), "--out", str(tmp_path / "a.yaml"))
-    result = main([*command])
-    done.set()
-    thread.join()
-    assert result == 1
-    assert re.search(r"the board is in none of the \d+ images \(\d+ no board\)", capsys.readouterr().err)
 
 
 def test_a_camera_that_is_not_there_is_unavailable(tmp_path: Path, told: Told, monkeypatch: Any) -> None:

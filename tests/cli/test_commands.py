@@ -94,6 +94,7 @@ def test_version(told: Told) -> None:
         (["sim", "--duration", "nan"], "flockd sim", "--duration: 'nan'"),
         (["sim", "--drones", "0"], "flockd sim", "--drones: '0'"),
         (["sim", "--drones", "5000"], "flockd sim", "--drones: '5000' is more than the 100 drones"),
+        (["sim", "--drones", "2.5"], "flockd sim", "--drones: '2.5'"),
         (["sim", "--seed", "9" * 5000], "flockd sim", f"--seed: '{'9' * 5000}'"),
         # The command's default would replace what stands before it: the hold went to every fleet.
         (["fleet", "--fleet", "other", "hold", "drone2"], "flockd fleet", "--fleet stands before the command "),

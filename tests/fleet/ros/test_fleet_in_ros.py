@@ -145,15 +145,3 @@ def test_a_peer_that_stops_holds_up_nobody(fleet: Fleet) -> None:
             assert fleet.node.call("/drone1/resume")["ok"]
         finally:
             stopped.process.send_signal(signal.SIGCONT)
-
-
-def test_a_bridge_that_starts_again_is_found_again() -> None:
-    environment, endpoint = own_domain(), free_endpoint()
-    with peer(environment, "patient") as patient, ExitStack() as stack:
-        patient.listen("/drone1/diagnostics", DIAGNOSTICS, "state")
-        with bridge(environment, "--drones-at", endpoint):
-            stack.enter_context(made_up_drones(endpoint, "--drones", "1"))
-            patient.newest("/drone1/diagnostics")
-        before = len(patient.heard("/drone1/diagnostics"))
-        with bridge(environment, "--drones-at", endpoint):
-            until(lambda: len(patient.heard("/drone1/diagnostics")) > before)
