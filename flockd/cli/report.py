@@ -57,15 +57,13 @@ def _run(args: argparse.Namespace) -> int:
     from flockd.review.report.summary import summarise
 
     directory: Path = args.flight
-    if _is_flight(directory):
+    if (directory / LOG_NAME).is_file():
         why = f"is for recordings, and {directory} is a flight's folder, whose report is written into it; drop it"
         refuse(args, ("out", "without_pictures"), why)
         try:
             log = FlightLog.load(directory / LOG_NAME)
         except (ValueError, EOFError, BadZipFile) as error:
-            why = (
-                "no NumPy archive" if "pickle" in str(error) else str(error)
-            )  # numpy's advice, to load it nevertheless
+            why = "no NumPy archive" if "pickle" in str(error) else str(error)  # numpy advises to load it all the same
             told = f"is not a whole flight log ({why}); fly again with `flockd sim`"
             raise UsageError(f"{directory / LOG_NAME}: {told}") from error
         if (directory / REPORT_NAME).is_file() and not args.force:
@@ -81,12 +79,6 @@ def _run(args: argparse.Namespace) -> int:
     with progress("writing the report", "figures") as tell_progress:
         summary = write_report_files(directory, log, tell_progress)
     return show_summary(directory, log, summary, as_json=args.json)
-
-
-def _is_flight(folder: Path) -> bool:
-    from flockd.review.report.flight_folder import LOG_NAME
-
-    return (folder / LOG_NAME).is_file()
 
 
 def _recordings(path: Path) -> tuple[Path, ...]:

@@ -150,8 +150,7 @@ class PageServer:
 
     async def _ask(self, request: web.Request) -> web.Response:
         """Sends a command to drones; one answer for each. Only for this server's own page."""
-        refusal = self._refusal_to_command(request)
-        if refusal is not None:
+        if (refusal := self._refusal_to_command(request)) is not None:
             return refusal
         try:
             drones, command, order = _asked(_object(await request.read()))
@@ -173,8 +172,7 @@ class PageServer:
 
     async def _simulate(self, request: web.Request) -> web.Response:
         """Sends a control to the simulation. Only for this server's own page."""
-        refusal = self._refusal_to_command(request)
-        if refusal is not None:
+        if (refusal := self._refusal_to_command(request)) is not None:
             return refusal
         if self._simulation is None:
             return _text(403, "these drones are not simulated here: there is nothing to control beside them")
@@ -225,9 +223,8 @@ class PageServer:
         if not self._access.is_token(request.cookies.get(self._access.cookie), hello.get("token")):
             await socket.close(code=4403, message=b"load the page again")
             return
-        feed = _Feed(self._source, socket, self._simulation)
-        await feed.greet(may_command=self._may_command)
-        await feed.push()
+        await socket.send_str(_json({"kind": "hello", "may_command": self._may_command}))
+        await _Feed(self._source, socket, self._simulation).push()
 
     def _operator_of(self, request: web.Request) -> str:
         """The operator's name with the page's number and its computer."""
@@ -244,10 +241,6 @@ class _Feed:
         self._sent: dict[str, Row] = {}
         self._event: Event | None = None
         """State of the last message."""
-
-    async def greet(self, *, may_command: bool) -> None:
-        """The first message: the server's settings."""
-        await self._send({"kind": "hello", "may_command": may_command})
 
     async def push(self) -> None:
         """Sends changes until the page is closed."""
@@ -275,19 +268,15 @@ class _Feed:
         seen = len(events) - events[::-1].index(self._event) if self._event in events else 0
         new = events[seen:]
         self._event = events[-1] if events else self._event
-        await self._send(
-            {
-                "kind": "rows",
-                "time_s": time_s,
-                "order": list(rows),
-                "rows": changed,
-                "events": new,
-                "notes": self._source.notes(),
-                "simulation": None if self._simulation is None else self._simulation.state(),
-            }
-        )
-
-    async def _send(self, message: dict[str, Any]) -> None:
+        message = {
+            "kind": "rows",
+            "time_s": time_s,
+            "order": list(rows),
+            "rows": changed,
+            "events": new,
+            "notes": self._source.notes(),
+            "simulation": None if self._simulation is None else self._simulation.state(),
+        }
         await self._socket.send_str(_json(message))
 
 

@@ -33,8 +33,8 @@ _ABOVE = np.array([0.0, 0.0, 0.6])
 def markers(time_ns: int, name: str, number: int, row: Row) -> Tree:
     """Markers of one drone; only their deletion if its position is not known. ``number`` chooses its colour."""
     drawn: list[Tree] = [{"header": header(time_ns, MAP), "action": _DELETE_ALL}]
-    place = place_in_map(row)
-    if place is not None:
+    if row["position_ne"] is not None:
+        place = home_in_map(row) + enu_of_ned(np.array([*row["position_ne"], -(row["height_m"] or 0.0)]))
         colour = COLOURS[number % len(COLOURS)]
         parts = [
             *_body(name, row, place, colour),
@@ -44,13 +44,6 @@ def markers(time_ns: int, name: str, number: int, row: Row) -> Tree:
         ]
         drawn += [{"header": header(time_ns, MAP), "ns": name, "id": i, **part} for i, part in enumerate(parts)]
     return {"markers": drawn}
-
-
-def place_in_map(row: Row) -> FloatArray | None:
-    """(3,) metres east, north, up; None: the position is not known."""
-    if row["position_ne"] is None:
-        return None
-    return home_in_map(row) + enu_of_ned(np.array([*row["position_ne"], -(row["height_m"] or 0.0)]))
 
 
 def home_in_map(row: Row) -> FloatArray:

@@ -50,16 +50,17 @@ class RosNode:
             for key, value in HERE_ONLY.items():
                 os.environ.setdefault(key, value)
         rclpy = _rclpy()
+        from rclpy.executors import MultiThreadedExecutor  # noqa: PLC0415 - of an extra
+        from rclpy.signals import SignalHandlerOptions  # noqa: PLC0415
+
         self._context = rclpy.Context()
         try:
-            rclpy.init(context=self._context, signal_handler_options=_no_signals())
+            rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
             self._node = rclpy.create_node(name, context=self._context)
         except Exception as error:  # of pybind11's own types: RCLError and others
             raise UnavailableError(
                 f"ROS 2 cannot start ({str(error).splitlines()[0]}); check its environment"
             ) from error
-        from rclpy.executors import MultiThreadedExecutor  # noqa: PLC0415 - of an extra
-
         self._executor = MultiThreadedExecutor(num_threads=_THREADS, context=self._context)
         self._executor.add_node(self._node)
         self._publishers: dict[str, Any] = {}
@@ -133,12 +134,6 @@ def _rclpy() -> Any:
             f"rclpy cannot be loaded ({reason}); run flockd with the Python of a whole ROS 2"
         ) from error
     return rclpy
-
-
-def _no_signals() -> Any:
-    from rclpy.signals import SignalHandlerOptions  # noqa: PLC0415
-
-    return SignalHandlerOptions.NO
 
 
 def _one_at_a_time() -> Any:
