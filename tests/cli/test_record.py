@@ -47,10 +47,7 @@ def test_info_tells_of_a_recording_that_was_cut_off(cut_off: Path, told: Told) -
     [
         (None, "does not exist"),
         (b"not a recording", "is not a recording (it does not begin as MCAP files do); name another file"),
-        (
-            b"version https://git-lfs.github.com/spec/v1\n",
-            "is not a recording (but a pointer of Git LFS); fetch the file with `git lfs pull`",
-        ),
+        (b"version https://git-lfs.github.com/spec/v1\n", "is not a recording (but a pointer of Git LFS); fetch"),
         (b"#ROSBAG V2.0\n", "is not a recording (but a bag of ROS 1); make one of ROS 2 of it with `rosbags-convert`"),
         (b"\x89MCAP0\r\n", "nothing in it can be read"),
         (7000, "is cut off before the configuration|holds no step"),

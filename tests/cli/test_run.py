@@ -152,10 +152,7 @@ def test_a_changed_model_is_refused(tmp_path: Path, capsys: pytest.CaptureFixtur
         ({"autopilot": None}, " autopilot: is missing; "),
         ({"source": None}, " source: is missing; "),
         ({"autopilot": {"adress": "udpin://x"}}, "autopilot.adress: is not a known key; did you mean `address`?"),
-        (
-            {"autopilot": {"arm_and_take_off": False}},
-            "a pilot or a ground station arms, takes off",
-        ),
+        ({"autopilot": {"arm_and_take_off": False}}, "a pilot or a ground station arms, takes off"),
         ({"safety": {"hover_s": 1e9}}, "safety.hover_s: 1000000000.0 is not at most 3; write "),
         ({"safety": {"heartbeat_timeout_s": "2 s"}}, "safety.heartbeat_timeout_s: 2 s is not a number"),
         ({"perception": {"deadline_s": 1e9}}, "perception.deadline_s: 1000000000.0 is not "),

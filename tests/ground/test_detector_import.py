@@ -156,13 +156,7 @@ def test_an_imported_detector_detects(tmp_path: Path, capsys: pytest.CaptureFixt
     ("output", "options", "said", "code", "sentence"),
     [
         (yolov8(), {"drone": "uav"}, AGPL, 2, "has no class 'uav' but has bird, drone; write --drone with a name, or"),
-        (
-            yolov8(),
-            {"drone": "2"},
-            {},
-            2,
-            "no class '2' but does not name its classes; write --drone with a name, or a",
-        ),
+        (yolov8(), {"drone": "2"}, {}, 2, "no class '2' but does not name its classes; write --drone with a name, or"),
         (yolov8(), {"licence": ""}, AGPL, 2, "write it with --licence (the file says 'AGPL-3.0 License"),
         (yolov8(), {}, {"task": "segment", **AGPL}, 78, "is a network for the task 'segment'; export one that detects"),
         (np.zeros((1, 7, 99), np.float32), {}, AGPL, 78, "gives output0 [1, 7, 99] for an image of 64 x 64, as no"),

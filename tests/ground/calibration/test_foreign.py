@@ -198,48 +198,26 @@ def test_an_omnidirectional_lens_of_opencv_has_its_xi_and_its_skew(tmp_path: Pat
     assert np.degrees(np.arccos(cosines.min())) < off_deg
 
 
-WIDE = KALIBR.replace("[652.3, 647.9, 324.1, 235.0]", "NUMBERS")
+def _kalibr(camera: str, model: str, coefficients: list[float], numbers: list[float]) -> str:
+    text = KALIBR.replace("[652.3, 647.9, 324.1, 235.0]", str(numbers))
+    return _filled(text, coefficients, CAMERA=camera, MODEL=model)
+
+
+OMNI = _kalibr("omni", "radtan", [-0.1, 0.03, 0.001, -0.002], [1.2, 450, 452, 322, 241])
+DOUBLE = _kalibr("ds", "none", [], [-0.2, 0.59, 250, 251, 322, 241])
+UNIFIED = _kalibr("eucm", "none", [], [0.6, 1.1, 300, 301, 322, 241])
+PRISM = "1 THIN_PRISM_FISHEYE 640 480 300 301 322 241 0.02 -0.01 0.003 -0.001 0.002 -0.0004 0.004 -0.003\n"
 
 
 @pytest.mark.parametrize(
     ("text", "theirs", "focal_px", "centre_px", "most_deg", "told"),
     [
         (_filled(ROS, RATIONAL, MODEL="rational_polynomial"), _rational, (652.3, 647.9), (324.6, 235.5), 60, "pinhole"),
-        (
-            _filled(
-                WIDE, [-0.1, 0.03, 0.001, -0.002], CAMERA="omni", MODEL="radtan", NUMBERS="[1.2, 450, 452, 322, 241]"
-            ),
-            _mei,
-            (450, 452),
-            (322.5, 241.5),
-            110,
-            "wide_angle",
-        ),
-        (
-            _filled(WIDE, [], CAMERA="ds", MODEL="none", NUMBERS="[-0.2, 0.59, 250, 251, 322, 241]"),
-            _double_sphere,
-            (250, 251),
-            (322.5, 241.5),
-            110,
-            "wide_angle",
-        ),
-        (
-            _filled(WIDE, [], CAMERA="eucm", MODEL="none", NUMBERS="[0.6, 1.1, 300, 301, 322, 241]"),
-            _eucm,
-            (300, 301),
-            (322.5, 241.5),
-            100,
-            "wide_angle",
-        ),
+        (OMNI, _mei, (450, 452), (322.5, 241.5), 110, "wide_angle"),
+        (DOUBLE, _double_sphere, (250, 251), (322.5, 241.5), 110, "wide_angle"),
+        (UNIFIED, _eucm, (300, 301), (322.5, 241.5), 100, "wide_angle"),
         (_filled(KALIBR, [0.9], CAMERA="pinhole", MODEL="fov"), _fov, (652.3, 647.9), (324.6, 235.5), 60, "pinhole"),
-        (
-            "1 THIN_PRISM_FISHEYE 640 480 300 301 322 241 0.02 -0.01 0.003 -0.001 0.002 -0.0004 0.004 -0.003\n",
-            _thin_prism,
-            (300, 301),
-            (322, 241),
-            85,
-            "wide_angle",
-        ),
+        (PRISM, _thin_prism, (300, 301), (322, 241), 85, "wide_angle"),
         ("1 DIVISION 640 480 500 501 322 241 -0.25\n", _division, (500, 501), (322, 241), 60, ""),
         ("1 EUCM 640 480 300 301 322 241 0.6 1.1\n", _eucm, (300, 301), (322, 241), 85, "wide_angle"),
     ],
@@ -276,13 +254,9 @@ def test_a_lens_without_an_equal_is_refused_with_how_far_the_nearest_is_off(
     off = np.degrees(np.arccos(np.clip(cosines, -1, 1)))
     assert off.max() == pytest.approx(off_deg, rel=0.1, abs=2e-3)
     area = (pixels[seen] // 20).astype(int)  # as pixels count, not directions
-    weights = (
-        1
-        / np.unique(area, axis=0, return_inverse=True, return_counts=True)[2][
-            np.unique(area, axis=0, return_inverse=True)[1].ravel()
-        ]
-    )
-    assert math.sqrt(np.average(off**2, weights=weights)) == pytest.approx(rms_deg, rel=0.1, abs=1e-3)
+    _, of, counts = np.unique(area, axis=0, return_inverse=True, return_counts=True)
+    rms = math.sqrt(np.average(off**2, weights=1 / counts[of.ravel()]))
+    assert rms == pytest.approx(rms_deg, rel=0.1, abs=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -295,13 +269,10 @@ def test_a_lens_without_an_equal_is_refused_with_how_far_the_nearest_is_off(
         ("1 EUCM 640 480 300 301 322 241 0.6 90000\n", "camera1: by its parameters it images hardly anything"),
         (
             _filled(ROS, PINHOLE, MODEL="plumb_bob").replace("[652.3, 0.", "[652.3, 9."),
-            "its plumb_bob of 5 coefficients with a skew of 9 px has no equivalent",
+            "its plumb_bob of 5 coefficients with a skew of 9 px has no",
         ),
         ("1 RAD_TAN_THIN_PRISM_FISHEYE 640 480 1 2 3\n", "camera1: has the lens model RAD_TAN_THIN_PRISM_FISHEYE"),
-        (
-            _filled(ROS, PINHOLE, MODEL="plumb_bob").replace("640", "320"),
-            "head_camera: intrinsics.cx: 324.6 is 51% of the image",
-        ),
+        (_filled(ROS, PINHOLE, MODEL="plumb_bob").replace("640", "320"), "head_camera: intrinsics.cx: 324.6 is 51%"),
         ("cam0: 5\n", "holds no camera; give Kalibr's camchain"),
         (_filled(ROS, PINHOLE, MODEL="plumb_bob").replace("640", "640.5"), "width and height of Head Camera, as whole"),
         (_filled(ROS, PINHOLE, MODEL="plumb_bob").replace("640", "-640"), "head_camera: size: -640 x 480 is not of 32"),
@@ -309,10 +280,7 @@ def test_a_lens_without_an_equal_is_refused_with_how_far_the_nearest_is_off(
         ("1 PINHOLE 640 480 650 650 320 240\n" * 2, "has two cameras of the name camera1; give each its own"),
         ("rig: {}\n", "is a drone's own file; copy the cameras of its `rig`"),
         ("just a text\n", "lacks or garbles keys with values; give Kalibr's camchain"),
-        (
-            _filled(KALIBR, [], MODEL="none", CAMERA="pinhole").replace(", 324.1, 235.0]", "]"),
-            "lacks or garbles the intrinsics of cam0, fx fy cx cy; give",
-        ),
+        (_filled(KALIBR, [], MODEL="none", CAMERA="pinhole").replace(", 324.1, 235.0]", "]"), "of cam0, fx fy cx cy;"),
         (_filled(KALIBR, [0.1, 0, 0, math.nan], MODEL="radtan", CAMERA="pinhole").replace("nan", ".nan"), "finite"),
         ("1 OPENCV 640 480 1 2 3\n", "lacks or garbles the parameters of OPENCV, fx fy cx cy k1 k2 p1 p2"),
         ("camera_matrix: {data: [1, 2]}\n", "lacks or garbles the camera_matrix, 2 numbers; give Kalibr's camchain"),

@@ -244,11 +244,7 @@ def test_the_shipped_calibrations_can_be_true(camera: CameraConfig) -> None:
         ({"fx": 337.0}, "fx 337 and fy 320 differ by 5%", "calibrate this camera"),
         ({"fx": 1100.0, "fy": 1100.0}, "32 degrees of view show few neighbours", "calibrate this camera"),
         # Equidistant, half a turn wide: of the width 63 of 90 degrees are seen, and all of the height.
-        (
-            {"model": "wide_angle", "fx": 203.7, "fy": 203.7},
-            "of the image shows what is more than 63 deg",
-            "narrow the",
-        ),
+        ({"model": "wide_angle", "fx": 203.7, "fy": 203.7}, "of the image shows what is more than 63", "narrow the"),
     ],
 )
 def test_an_unlikely_calibration_or_one_beyond_the_networks_is_reported(

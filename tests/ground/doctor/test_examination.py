@@ -54,11 +54,7 @@ def test_a_check_that_hangs_is_a_failure_and_what_it_found_before_counts() -> No
 @pytest.mark.parametrize(
     ("error", "measured", "fix"),
     [
-        (
-            ModelError("a.yaml: sha256: changed; and more; restore it"),
-            "a.yaml: sha256: changed; and more",
-            "restore it",
-        ),
+        (ModelError("a.yaml: sha256: off; and more; restore it"), "a.yaml: sha256: off; and more", "restore it"),
         (ModelError("all is lost"), "all is lost", "correct it"),
         (OSError(5, "Input/output error", "/dev/x"), "/dev/x: Input/output error", "check that it responds"),
         (ImportError("libmavsdk.so is not there"), "libmavsdk.so is not there", "install flockd again"),
