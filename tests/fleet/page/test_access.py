@@ -9,6 +9,7 @@ import socket
 from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 from aiohttp import WSMsgType, web
@@ -60,13 +61,11 @@ class Asked(LiveFleet):
 
 
 @asynccontextmanager
-async def served(
-    *, may_command: bool = True, fleet: LiveFleet | None = None
-) -> AsyncIterator[tuple[Client, PageAccess, Asked]]:
+async def served(fleet: LiveFleet | None = None, **more: Any) -> AsyncIterator[tuple[Client, PageAccess, Asked]]:
     """A server, of ``fleet`` or of one that notes what is asked, and a browser without a page."""
     access, noted = PageAccess(), Asked()
-    server = TestServer(PageServer(fleet or noted, access, may_command=may_command).application(), host="127.0.0.1")
-    async with TestClient(server) as client:
+    page = PageServer(fleet or noted, access, **{"may_command": True, **more})
+    async with TestClient(TestServer(page.application(), host="127.0.0.1")) as client:
         yield client, access, noted
 
 

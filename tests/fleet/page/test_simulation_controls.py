@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import pytest
-from aiohttp import WSMsgType, web
-from aiohttp.test_utils import TestClient, TestServer
+from aiohttp import WSMsgType
 
-from flockd.fleet.page.page_access import PageAccess
-from flockd.fleet.page.page_server import PageServer
 from flockd.fleet.simulation import SimulationLink, SimulationMessage, key_of
 from flockd.fleet.watcher import FleetWatcher
 from flockd.onboard.telemetry.publisher import ZenohTelemetry
 from flockd.onboard.telemetry.topics import PREFIX, AboutMessage, AnswerMessage
 from flockd.sim.sitl.processes import free_endpoint
 from tests.calm import until
-from tests.fleet.page.test_access import Asked, opened
+from tests.fleet.page.test_access import Client, opened, served
 
 PAUSE = {"control": "pause", "value": None}
 
@@ -43,14 +39,7 @@ class Simulated:
         return AnswerMessage(accepted=True, sentence="done")
 
 
-def client_of(
-    simulation: Any, access: PageAccess, *, may_command: bool = True
-) -> TestClient[web.Request, web.Application]:
-    page = PageServer(Asked(), access, may_command=may_command, operator="anna", simulation=simulation)
-    return TestClient(TestServer(page.application(), host="127.0.0.1"))
-
-
-async def shown_by(client: TestClient[web.Request, web.Application], headers: Mapping[str, str]) -> object:
+async def shown_by(client: Client, headers: Mapping[str, str]) -> object:
     """What the page is told of a simulation."""
     async with client.ws_connect("/live", headers={"Origin": headers["Origin"]}) as socket:
         await socket.send_json({"token": headers["X-Flockd-Token"]})
@@ -63,8 +52,7 @@ async def shown_by(client: TestClient[web.Request, web.Application], headers: Ma
 
 
 async def test_a_page_of_drones_that_are_not_simulated_here_shows_no_control_and_sends_none() -> None:
-    access = PageAccess()
-    async with client_of(None, access) as client:
+    async with served() as (client, access, _):
         headers = await opened(client, access)
         assert await shown_by(client, headers) is None
         reply = await client.post("/simulate", json=PAUSE, headers=headers)
@@ -74,8 +62,8 @@ async def test_a_page_of_drones_that_are_not_simulated_here_shows_no_control_and
 
 
 async def test_controls_need_what_commands_need() -> None:
-    access, simulated = PageAccess(), Simulated()
-    async with client_of(simulated, access) as client:
+    simulated = Simulated()
+    async with served(simulation=simulated, operator="anna") as (client, access, _):
         assert (await client.post("/simulate", json=PAUSE)).status == 403, "without the key"
         headers = await opened(client, access)
         for wrong in ({"Origin": "http://other"}, {"X-Flockd-Token": "x"}, {"Origin": ""}):
@@ -88,7 +76,7 @@ async def test_controls_need_what_commands_need() -> None:
             assert (await client.post("/simulate", json=body, headers=headers)).status == 400, body
         ((control, value, operator),) = simulated.asked
         assert (control, value, operator[:11]) == ("pause", {}, "anna, page ")
-    async with client_of(simulated, access, may_command=False) as client:
+    async with served(simulation=simulated, may_command=False) as (client, access, _):
         headers = await opened(client, access)
         assert (await client.post("/simulate", json=PAUSE, headers=headers)).status == 403, "--watch-only"
         assert len(simulated.asked) == 1

@@ -1,4 +1,5 @@
-"""What goes out to ROS 2, against values worked out by hand from REP 103, REP 117 and the messages' definitions."""
+"""What goes out to ROS 2, against values worked out by hand from REP 103, REP 117 and the messages' definitions: single
+messages, and what `flockd ros` makes of a drone's telemetry."""
 
 from __future__ import annotations
 
@@ -9,9 +10,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flockd.core.messages import FloatArray
+from flockd.fleet.drone_rows import WORST_FIRST, Known, drone_rows, origin_of
 from flockd.fleet.ros import message_trees as trees
+from flockd.fleet.ros.fleet_bridge import _LEVELS, _status, _transforms
+from flockd.fleet.ros.fleet_markers import markers
 from flockd.fleet.ros.message_trees import Names
-from flockd.onboard.telemetry.topics import NeighbourMessage, ObstaclesMessage, StateMessage
+from flockd.fleet.ros.ros_frames import rotation_of
+from flockd.fleet.watcher import Heard, Watched
+from flockd.onboard.telemetry.topics import AboutMessage, NeighbourMessage, ObstaclesMessage, StateMessage
+from tests.make import flight_message
 
 NAMES = Names("drone1")
 STATE = StateMessage(
@@ -84,3 +92,60 @@ def test_a_scan_clears_nothing_that_was_not_seen() -> None:
     assert tree["range_max"] == 10.0
     assert tree["angle_max"] == pytest.approx(math.pi - 2 * math.pi / 72)
     assert trees.scan(0, NAMES, ObstaclesMessage(time_s=0.0, range_m=[], seen_m=[])) is None
+
+
+ABOUT = AboutMessage(version="1", configuration={"mission": {"origin_m": [3.0, -4.0]}}, commands=[])
+FLIGHT = flight_message(
+    state="degraded", reasons=[{"event": "x", "sentence": "the battery is low; land"}], battery_share=0.4, height_m=3.0
+)
+
+
+def row() -> dict[str, Any]:
+    topics = {"state": Heard(0.0, {**STATE}), "flight": Heard(0.0, FLIGHT)}
+    drone = Watched("f", "drone1", alive=True, topics=topics, seen=True)
+    return drone_rows([drone], {"f/drone1": Known(ABOUT)}, 0.0)["f/drone1"]
+
+
+def placed(transform: dict[str, Any], point: list[float]) -> FloatArray:
+    """A point of the child's frame in its parent's."""
+    place = np.array(list(transform["transform"]["translation"].values()))
+    turn = np.array(list(transform["transform"]["rotation"].values()))
+    found: FloatArray = rotation_of(turn) @ np.array(point) + place
+    return found
+
+
+def test_transforms_lead_from_the_map_to_the_body() -> None:
+    """East 2, north 1, up 3, facing east."""
+    tree = _transforms(0, NAMES, STATE, row())
+    assert tree is not None
+    by_child = {one["child_frame_id"]: one for one in tree["transforms"]}
+    parents = {child: one["header"]["frame_id"] for child, one in by_child.items()}
+    assert parents == {"drone1/odom": "map", "drone1/level": "drone1/odom", "drone1/base_link": "drone1/odom"}
+    np.testing.assert_allclose(placed(by_child["drone1/base_link"], [1.0, 0.0, 0.0]), [3.0, 1.0, 3.0], atol=1e-9)
+    np.testing.assert_allclose(placed(by_child["drone1/level"], [0.0, 1.0, 0.0]), [2.0, 2.0, 3.0], atol=1e-9)
+    assert _transforms(0, NAMES, {**STATE, "position_ne": None}, row()) is None
+
+
+def test_a_state_comes_with_its_reasons_and_its_level() -> None:
+    status = _status("drone1", row())
+    assert (status["level"], status["name"]) == (1, "drone1: flockd"), "WARN"
+    assert status["message"] == "degraded: the battery is low; land"
+    assert {"key": "battery_share", "value": "0.4"} in status["values"]
+    assert {"key": "armed", "value": "true"} in status["values"]
+    assert set(_LEVELS) == set(WORST_FIRST), "every state has a level"
+
+
+def test_markers_stand_where_the_drone_is() -> None:
+    """In `map`; the course is the own velocity over two seconds: 1 m/s to the north, 0.5 to the east, 0.25 up."""
+    first, *drawn = markers(0, "drone1", 0, row())["markers"]
+    assert first["action"] == 3, "what was drawn before is deleted"
+    assert list(drawn[0]["pose"]["position"].values()) == [2.0, 1.0, 3.0]
+    assert [list(point.values()) for point in drawn[3]["points"]] == [[2.0, 1.0, 3.0], [3.0, 3.0, 3.5]]
+    assert len({marker["id"] for marker in drawn}) == len(drawn)
+    assert len(markers(0, "drone1", 0, {**row(), "position_ne": None})["markers"]) == 1
+
+
+@pytest.mark.parametrize("mission", [None, {}, {"origin_m": [1.0]}, {"origin_m": ["a", "b"]}])
+def test_an_origin_that_a_peer_does_not_tell_is_none(mission: Any) -> None:
+    assert origin_of({"mission": mission}) is None
+    assert origin_of(ABOUT["configuration"]) == [3.0, -4.0]
