@@ -12,14 +12,14 @@ import cv2
 import numpy as np
 import pytest
 
-from flockd.cli import main
 from flockd.core.config import load_drone
 from flockd.core.config.document import read_document
 from flockd.core.errors import ConfigError
 from flockd.core.messages import FloatArray
 from flockd.flight.geometry import build_rig
+from tests.conftest import Told
 
-Capture = pytest.CaptureFixture[str]
+Imported = Callable[..., str]
 K = np.array([[652.3, 0.0, 324.1], [0.0, 647.9, 235.0], [0.0, 0.0, 1.0]])
 PINHOLE = [-0.15, 0.136, 0.0035, 0.0083, -0.34]
 FISHEYE = [0.0035, 0.0007, -0.002, 0.0002]
@@ -70,6 +70,28 @@ def _points() -> FloatArray:
     return np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1)
 
 
+@pytest.fixture
+def imported(tmp_path: Path, told: Told) -> Imported:
+    """What `flockd calibrate import` says of a file, or of one with this text, that it writes to `ours.yaml`."""
+
+    def run(code: int, given: str | Path, *options: object) -> str:
+        file = given if isinstance(given, Path) else tmp_path / "theirs.yaml"
+        if isinstance(given, str):
+            file.write_text(given, encoding="utf-8")
+        return told(code, "calibrate", "import", file, "--out", tmp_path / "ours.yaml", *options)
+
+    return run
+
+
+def stored(file: Path, **values: Any) -> Path:
+    """As OpenCV's programs write it."""
+    storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
+    for name, value in values.items():
+        storage.write(name, np.array(value))
+    storage.release()
+    return file
+
+
 @pytest.mark.parametrize(
     ("text", "coefficients", "matrix", "fisheye"),
     [
@@ -84,46 +106,32 @@ def _points() -> FloatArray:
     ids=["ros", "ros fisheye", "kalibr", "kalibr fisheye", "colmap", "ros2 topic echo", "rostopic echo"],
 )
 def test_points_are_where_opencv_images_them(
-    text: str, coefficients: list[float], matrix: FloatArray, fisheye: bool, tmp_path: Path
+    text: str, coefficients: list[float], matrix: FloatArray, fisheye: bool, tmp_path: Path, imported: Imported
 ) -> None:
-    (tmp_path / "theirs.yaml").write_text(text, encoding="utf-8")
-    out = tmp_path / "ours.yaml"
-    assert main(["calibrate", "import", str(tmp_path / "theirs.yaml"), "--out", str(out)]) == 0
-    (name, *_) = (rig := build_rig(load_drone(out).rig)).cameras
+    imported(0, text)
+    (name, *_) = (rig := build_rig(load_drone(tmp_path / "ours.yaml").rig)).cameras
     still, project = np.zeros(3), cv2.fisheye.projectPoints if fisheye else cv2.projectPoints
     pixels: Any = project(_points()[:, None], still, still, matrix, np.array(coefficients))[0]
     np.testing.assert_allclose(rig.cameras[name].camera.project(_points()), pixels.reshape(-1, 2) + 0.5, atol=1e-3)
 
 
-def test_what_opencv_stores_is_read_under_its_names_and_needs_a_size(tmp_path: Path, capsys: Capture) -> None:
-    file, out = tmp_path / "lens.yml", tmp_path / "ours.yaml"
-    storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
-    storage.write("K", K)
-    storage.write("D", np.array(PINHOLE))
-    storage.release()
-    assert main(["calibrate", "import", str(file), "--out", str(out)]) == 1
-    assert "lacks or garbles the size of the images, which --size gives" in capsys.readouterr().err
-    assert main(["calibrate", "import", str(file), "--out", str(out), "--size", "640x480"]) == 0
-    (camera,) = load_drone(out).rig.cameras
+def test_what_opencv_stores_is_read_under_its_names_and_needs_a_size(tmp_path: Path, imported: Imported) -> None:
+    file = stored(tmp_path / "lens.yml", K=K, D=PINHOLE)
+    assert "lacks or garbles the size of the images, which --size gives" in imported(1, file)
+    imported(0, file, "--size", "640x480")
+    (camera,) = load_drone(tmp_path / "ours.yaml").rig.cameras
     assert (camera.size_px, camera.intrinsics.cx, camera.intrinsics.distortion) == ((640, 480), 324.6, tuple(PINHOLE))
 
 
-def test_both_cameras_of_opencvs_stereo_calibration_are_read(tmp_path: Path) -> None:
-    file, out = tmp_path / "pair.yml", tmp_path / "ours.yaml"
-    storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
-    for number, k in (("1", PINHOLE), ("2", PINHOLE[:4])):
-        storage.write(f"M{number}", K)
-        storage.write(f"D{number}", np.array(k))
-    storage.release()
-    assert main(["calibrate", "import", str(file), "--out", str(out), "--size", "640x480"]) == 0
-    found = {camera.name: camera.intrinsics.distortion for camera in load_drone(out).rig.cameras}
+def test_both_cameras_of_opencvs_stereo_calibration_are_read(tmp_path: Path, imported: Imported) -> None:
+    imported(0, stored(tmp_path / "pair.yml", M1=K, D1=PINHOLE, M2=K, D2=PINHOLE[:4]), "--size", "640x480")
+    found = {camera.name: camera.intrinsics.distortion for camera in load_drone(tmp_path / "ours.yaml").rig.cameras}
     assert found == {"pair1": tuple(PINHOLE), "pair2": tuple(PINHOLE[:4])}
 
 
-def test_another_size_than_the_files_is_refused(tmp_path: Path, capsys: Capture) -> None:
-    (file := tmp_path / "theirs.txt").write_text(COLMAP, encoding="utf-8")
-    assert main(["calibrate", "import", str(file), "--out", str(tmp_path / "x.yaml"), "--size", "1280x960"]) == 1
-    assert "camera1: is of 640 x 480 images, and --size is another; leave it out" in capsys.readouterr().err
+def test_another_size_than_the_files_is_refused(imported: Imported) -> None:
+    told_of = imported(1, COLMAP, "--size", "1280x960")
+    assert "camera1: is of 640 x 480 images, and --size is another; leave it out" in told_of
 
 
 def _brown(plane: FloatArray, k: list[float], prism: tuple[float, float] = (0.0, 0.0)) -> FloatArray:
@@ -177,21 +185,17 @@ def _rational(rays: FloatArray) -> FloatArray:
     return np.asarray(found.reshape(-1, 2), np.float64)
 
 
-def test_an_omnidirectional_lens_of_opencv_has_its_xi_and_its_skew(tmp_path: Path, capsys: Capture) -> None:
+def test_an_omnidirectional_lens_of_opencv_has_its_xi_and_its_skew(tmp_path: Path, imported: Imported) -> None:
     """As `cv2.omnidir.calibrate` gives them, at whole pixel centres."""
-    file, out, k = tmp_path / "lens.yml", tmp_path / "ours.yaml", [-0.1, 0.03, 0.001, -0.002]
-    storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
-    storage.write("camera_matrix", matrix := np.array([[450.0, 20.0, 322.0], [0.0, 452.0, 241.0], [0.0, 0.0, 1.0]]))
-    storage.write("distortion_coefficients", np.array([k]))
-    storage.write("xi", np.array([[1.2]]))
-    storage.release()
-    assert main(["calibrate", "import", str(file), "--out", str(out), "--size", "640x480"]) == 1
-    assert "its omnidir with a skew of 20 px has no equivalent; the nearest wide_angle" in capsys.readouterr().err
-    order = ["calibrate", "import", str(file), "--out", str(out), "--size", "640x480", "--nearest", "--json"]
-    assert main(order) == 0
-    off_deg = json.loads(capsys.readouterr().out)["cameras"][0]["off_deg"]
+    matrix = np.array([[450.0, 20.0, 322.0], [0.0, 452.0, 241.0], [0.0, 0.0, 1.0]])
+    coefficients = [[-0.1, 0.03, 0.001, -0.002]]
+    file = stored(tmp_path / "lens.yml", camera_matrix=matrix, distortion_coefficients=coefficients, xi=[[1.2]])
+    refused = imported(1, file, "--size", "640x480")
+    assert "its omnidir with a skew of 20 px has no equivalent; the nearest wide_angle" in refused
+    (camera,) = json.loads(imported(0, file, "--size", "640x480", "--nearest", "--json"))["cameras"]
+    off_deg = camera["off_deg"]
     assert off_deg < 4
-    (mounted,) = build_rig(load_drone(out).rig).cameras.values()
+    (mounted,) = build_rig(load_drone(tmp_path / "ours.yaml").rig).cameras.values()
     rays = _points() / np.linalg.norm(_points(), axis=1, keepdims=True)
     pixels = np.column_stack([_mei(rays), np.ones(len(rays))]) @ matrix.T + 0.5
     cosines = np.sum(mounted.camera.rays(pixels[:, :2]) * rays, axis=1)
@@ -210,7 +214,7 @@ PRISM = "1 THIN_PRISM_FISHEYE 640 480 300 301 322 241 0.02 -0.01 0.003 -0.001 0.
 
 
 @pytest.mark.parametrize(
-    ("text", "theirs", "focal_px", "centre_px", "most_deg", "told"),
+    ("text", "theirs", "focal_px", "centre_px", "most_deg", "model"),
     [
         (_filled(ROS, RATIONAL, MODEL="rational_polynomial"), _rational, (652.3, 647.9), (324.6, 235.5), 60, "pinhole"),
         (OMNI, _mei, (450, 452), (322.5, 241.5), 110, "wide_angle"),
@@ -229,21 +233,17 @@ def test_a_lens_without_an_equal_is_refused_with_how_far_the_nearest_is_off(
     focal_px: tuple[float, float],
     centre_px: tuple[float, float],
     most_deg: float,
-    told: str,
+    model: str,
     tmp_path: Path,
-    capsys: Capture,
+    imported: Imported,
 ) -> None:
     """Against each model's published projection, of directions all over the image."""
-    file, out = tmp_path / "theirs.yaml", tmp_path / "ours.yaml"
-    file.write_text(text, encoding="utf-8")
-    assert main(["calibrate", "import", str(file), "--out", str(out)]) == 1
-    refused = capsys.readouterr().err
-    assert main(["calibrate", "import", str(file), "--out", str(out), "--nearest", "--json"]) == 0
-    (result,) = json.loads(capsys.readouterr().out)["cameras"]
+    refused = imported(1, text)
+    (result,) = json.loads(imported(0, text, "--nearest", "--json"))["cameras"]
     off_deg, rms_deg = result["off_deg"], result["rms_deg"]
     assert f"nearest {result['intrinsics']['model']} is {off_deg:.3f} degrees off at most, {rms_deg:.3f} RMS" in refused
-    assert told in refused
-    (mounted,) = build_rig(load_drone(out).rig).cameras.values()
+    assert model in refused
+    (mounted,) = build_rig(load_drone(tmp_path / "ours.yaml").rig).cameras.values()
     angle, turn = (grid.ravel() for grid in np.mgrid[0.2:most_deg:400j, 0 : 2 * math.pi : 720j])
     angle = np.radians(angle)
     rays = np.stack([np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.cos(angle)], axis=1)
@@ -260,7 +260,7 @@ def test_a_lens_without_an_equal_is_refused_with_how_far_the_nearest_is_off(
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "sentence"),
     [
         (_filled(KALIBR, [], MODEL="none", CAMERA="unified"), "cam0: has the lens model unified, which is not known"),
         (_filled(KALIBR, [0.9], MODEL="wave", CAMERA="pinhole"), "cam0: has the lens model wave, which is not known"),
@@ -289,12 +289,10 @@ def test_a_lens_without_an_equal_is_refused_with_how_far_the_nearest_is_off(
         ("%YAML:1.0\n---\nK: 3\n", "OpenCV cannot read it; write it again"),
     ],
 )
-def test_what_cannot_be_taken_is_said_in_one_sentence(text: str, told: str, tmp_path: Path, capsys: Capture) -> None:
-    (tmp_path / "theirs.yaml").write_text(text, encoding="utf-8")
-    assert main(["calibrate", "import", str(tmp_path / "theirs.yaml"), "--out", str(tmp_path / "ours.yaml")]) == 1
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1
-    assert told in error
+def test_what_cannot_be_taken_is_said_in_one_sentence(
+    text: str, sentence: str, tmp_path: Path, imported: Imported
+) -> None:
+    assert sentence in imported(1, text)
     assert not (tmp_path / "ours.yaml").exists()
 
 
