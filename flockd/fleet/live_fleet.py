@@ -8,6 +8,7 @@ import time
 from collections import deque
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
 from typing import Self
 
 from flockd.fleet.drone_queries import ClockReading
@@ -34,6 +35,18 @@ ROWS_S = 0.1
 _ASKING_THREADS = 16
 
 
+@dataclass
+class _Contact:
+    """What a drone that is alive has answered, and when it is asked again."""
+
+    known: Known = field(default_factory=Known)
+    readings: deque[ClockReading] = field(default_factory=lambda: deque(maxlen=CLOCK_READINGS))
+    due_s: float = -math.inf
+    wait_s: float = 0.0
+    """Interval of queries while it does not answer."""
+    asking: bool = False
+
+
 class LiveFleet:
     """The state for the page and the bridge to ROS 2. Runs on the event loop; queries wait on threads.
 
@@ -44,13 +57,8 @@ class LiveFleet:
         """``watcher``: the caller closes it."""
         self._watcher = watcher
         self._lock = threading.Lock()
-        self._known: dict[str, Known] = {}
-        self._readings: dict[str, deque[ClockReading]] = {}
-        self._due_s: dict[str, float] = {}
-        """Time of the next query to each drone."""
-        self._waits_s: dict[str, float] = {}
-        """Interval of queries to drones that did not answer."""
-        self._asking: set[str] = set()
+        self._contacts: dict[str, _Contact] = {}
+        """By the drone's key. A drone that comes back gets a new one: its configuration may differ."""
         self._rows: tuple[float, dict[str, Row]] = -math.inf, {}
         self._history: dict[str, deque[list[float | None]]] = {}
         self._over = threading.Event()
@@ -81,7 +89,7 @@ class LiveFleet:
     def known(self) -> Mapping[str, Known]:
         """Replies to queries, by the drone's key."""
         with self._lock:
-            return dict(self._known)
+            return {key: contact.known for key, contact in self._contacts.items()}
 
     def rows(self, time_s: float) -> dict[str, Row]:
         """The row of each drone that was ever heard, by its key, the worst first."""
@@ -126,56 +134,38 @@ class LiveFleet:
             now_s, drones = time.monotonic(), self._watcher.drones()
             self._keep(now_s)
             alive = {f"{drone.fleet}/{drone.drone}": drone for drone in drones if drone.alive}
-            for key in (self._due_s.keys() | self.known().keys()) - alive.keys():
-                self._forget(key)
-            due = [key for key in alive if now_s >= self._due_s.get(key, -math.inf) and key not in self._asking]
-            due.sort(key=lambda key: (self._waits_s.get(key, 0.0), -alive[key].messages))  # silent ones last
-            for key in due[: _ASKING_THREADS - len(self._asking)]:
-                self._asking.add(key)
-                self._pool.submit(self._ask_one, key)
+            with self._lock:
+                self._contacts = {key: self._contacts.get(key) or _Contact() for key in alive}
+            due = [key for key, one in self._contacts.items() if now_s >= one.due_s and not one.asking]
+            due.sort(key=lambda key: (self._contacts[key].wait_s, -alive[key].messages))  # silent ones last
+            for key in due[: _ASKING_THREADS - sum(one.asking for one in self._contacts.values())]:
+                self._contacts[key].asking = True
+                self._pool.submit(self._ask_one, key, self._contacts[key])
 
     def _keep(self, now_s: float) -> None:
         rows = self.rows(now_s)
         with self._lock:
-            for key in self._history.keys() - rows.keys():
-                del self._history[key]
+            new = deque[list[float | None]](maxlen=round(HISTORY_S / LOOK_EVERY_S))
+            self._history = {key: self._history.get(key) or new.copy() for key in rows}
             for key, row in rows.items():
-                kept = self._history.setdefault(key, deque(maxlen=round(HISTORY_S / LOOK_EVERY_S)))
-                kept.append(history_row(row, now_s))
+                self._history[key].append(history_row(row, now_s))
 
-    def _forget(self, key: str) -> None:
-        """Deletes a drone's replies: when it comes back, its configuration may differ."""
-        self._due_s.pop(key, None)
-        self._waits_s.pop(key, None)
-        with self._lock:
-            self._known.pop(key, None)
-            self._readings.pop(key, None)
-
-    def _ask_one(self, key: str) -> None:
+    def _ask_one(self, key: str, contact: _Contact) -> None:
         """Queries one drone, on a separate thread."""
-        answered = False
+        reading: ClockReading | None = None
         try:
-            answered = self._learn(key)
-        finally:
-            before_s = self._waits_s.get(key, 0.0) or ASK_EVERY_S / 2
-            self._waits_s[key] = 0.0 if answered else min(2.0 * before_s, ASK_SILENT_S)
-            self._due_s[key] = time.monotonic() + (self._waits_s[key] or ASK_EVERY_S)
-            self._asking.discard(key)
-
-    def _learn(self, key: str) -> bool:
-        """Takes a drone's replies. Returns whether it answered."""
-        with self._lock:
-            about = self._known.get(key, Known()).about
-        about = about or self._watcher.queries.about(key)
-        reading = None if about is None else self._watcher.queries.clock(key)
-        with self._lock:
-            readings = self._readings.setdefault(key, deque(maxlen=CLOCK_READINGS))
+            about = contact.known.about or self._watcher.queries.about(key)
+            reading = None if about is None else self._watcher.queries.clock(key)
             if reading is None:
-                self._known[key] = Known(about)
-                return False
-            readings.append(reading)
-            self._known[key] = Known(about, reading.delay_s, min(readings).ahead_s)
-            return True
+                contact.known = Known(about)
+            else:
+                contact.readings.append(reading)
+                contact.known = Known(about, reading.delay_s, min(contact.readings).ahead_s)
+        finally:
+            before_s = contact.wait_s or ASK_EVERY_S / 2
+            contact.wait_s = min(2.0 * before_s, ASK_SILENT_S) if reading is None else 0.0
+            contact.due_s = time.monotonic() + (contact.wait_s or ASK_EVERY_S)
+            contact.asking = False
 
 
 def _rounded(count: int) -> int:
