@@ -23,8 +23,7 @@ if TYPE_CHECKING:
     from flockd.flight.geometry import Camera
     from flockd.ground.pictures.copies import Copies
     from flockd.ground.pictures.picture_files import Picture, PictureFile
-    from flockd.ground.pictures.single_frame import DetectedDrone, PictureDetector, PictureResult
-    from flockd.ground.pictures.video_tracks import VideoTracker
+    from flockd.ground.pictures.single_frame import DetectedDrone, PictureDetector
 
 MIN_FOV_DEG, MAX_FOV_DEG = 4.0, 170.0
 """Less are radians, or a telescope's."""
@@ -191,7 +190,10 @@ def _detected(
                     for one in picture.images(args.every):
                         _check_size(args, one, camera)
                         begin = time.perf_counter()
-                        result = _look(args, detector, camera, tracker, one)
+                        result = detector.detect(one.image, camera, fov_deg=args.fov).at_least(args.min_probability)
+                        if tracker is not None:
+                            followed = tracker.update(one.time_s, one.image.shape[1::-1], result.detections)
+                            result = replace(result, detections=followed)
                         seconds = time.perf_counter() - begin
                         if write is not None:
                             write(annotated(one.image, result))
@@ -201,21 +203,6 @@ def _detected(
                         tell(done, max(done, count))
                 except DatasetError as error:
                     left_out.append(str(error))
-
-
-def _look(
-    args: argparse.Namespace,
-    detector: PictureDetector,
-    camera: Camera | None,
-    tracker: VideoTracker | None,
-    picture: Picture,
-) -> PictureResult:
-    """The detections in a picture, or those of the tracks of a video."""
-    result = detector.detect(picture.image, camera, fov_deg=args.fov).at_least(args.min_probability)
-    if tracker is None:
-        return result
-    size = (picture.image.shape[1], picture.image.shape[0])
-    return replace(result, detections=tracker.update(picture.time_s, size, result.detections))
 
 
 def _check_size(args: argparse.Namespace, picture: Picture, camera: Camera | None) -> None:
