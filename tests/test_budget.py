@@ -23,7 +23,7 @@ LINES = {
     "flockd/core": 3_290,
     "flockd/flight": 9_840,
     "flockd/onboard": 9_250,
-    "flockd/fleet": 2_740,
+    "flockd/fleet": 2_700,
     "flockd/ground": 5_280,
     "flockd/review": 3_550,
     "flockd/sim": 8_930,
