@@ -19,6 +19,7 @@ import pytest
 import yaml
 
 from flockd.cli import main
+from flockd.core.config import DroneConfig
 from flockd.core.data import data_path
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from flockd.sim.sitl.processes import free_endpoint, free_port
@@ -167,6 +168,19 @@ def test_a_drone_that_cannot_be_flown_is_bad_configuration(
     last = capsys.readouterr().err.splitlines()[-1]
     assert last.startswith(f"{config}:")
     assert told in last
+
+
+def test_it_flies_in_its_layer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = _written(tmp_path, safety={"first_flight_layer": 2})
+    flown: list[DroneConfig] = []
+
+    async def fly(drone: DroneConfig, *_: object) -> None:
+        flown.append(drone)
+
+    monkeypatch.setattr("flockd.cli.run._fly", fly)
+    assert main(["run", "--config", str(config)]) == 0
+    (drone,) = flown
+    assert (drone.mission.height_m, drone.flocking.max_speed_m_s) == (7.0, 1.0)
 
 
 def test_a_file_where_the_recordings_folder_would_be(tmp_path: Path, told: Told) -> None:
