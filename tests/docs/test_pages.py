@@ -19,8 +19,6 @@ ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 PAGES = sorted([*DOCS.rglob("*.md"), ROOT / "README.md", ROOT / "CHANGELOG.md", ROOT / "CONTRIBUTING.md"])
 SNIPPET = re.compile(r'^--8<-- "(.+)"$', re.MULTILINE)
-NOT_HERE = re.compile(r"\b(mend|astray|wish|crew|chronicle|photographer|log book)\b", re.IGNORECASE)
-"""Words that have a plainer one; CONTRIBUTING lists those to use."""
 
 by_name = pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 
@@ -140,11 +138,6 @@ def test_configuration_keys_exist(page: Path) -> None:
         path = name.split(".")
         if path[0] in sections and path[-1] not in ("py", "mcap"):
             assert has_key(drone, path), name
-
-
-@by_name
-def test_plain_words(page: Path) -> None:
-    assert NOT_HERE.findall(prose_of(page)) == []
 
 
 def test_the_readme_is_short_and_shows_the_flock() -> None:
