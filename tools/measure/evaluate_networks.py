@@ -26,8 +26,7 @@ from flockd.flight.geometry import RangeMap, Rig, RigCamera
 from flockd.flight.perception import DisFlow, OnnxNetworks, Perception
 from flockd.flight.pilot.ground import level_ground
 from flockd.sim.renderer.drone_models import FAMILIES, drone_model
-from tools.training.dataset import HEIGHT, R_BODY_CAMERA, WIDTH, PairSet, open_pairs, rig_camera
-from tools.training.worlds import outline_of
+from tools.training.dataset import R_BODY_CAMERA, PairSet, open_pairs, rig_camera
 
 Array = NDArray[Any]
 SIZES_M = [drone_model(family, 0).size_m for family in range(FAMILIES)]
@@ -36,8 +35,6 @@ MIN_PIXELS = 6
 MASK_WITHIN_M = 10.0
 HEIGHT_SIGMA_M = 0.1
 """Standard deviation of the height above ground that an autopilot gives, by its barometer."""
-WHOLE_HIDES = 0.02
-"""A drone is whole when it is inside the image and no more of its outline is hidden than this."""
 RANGES_M = ((1.5, 5.0), (5.0, 10.0), (10.0, 20.0))
 WITH: dict[ScaleSource, str] = {
     "network": "RGB alone",
@@ -169,7 +166,7 @@ def look_at_pairs(pairs: PairSet, networks: OnnxNetworks) -> Findings:
             found.depth[scale].append(float(off.mean()) if off.size else 0.0)
         labels = view.cameras["camera"].labels
         _masks(((labels > 0) & (labels != UNCLASSED))[1::2, 1::2], ids, pairs, index, found)
-        compare_drones(view.detections, pairs, index, depth, ids, found)
+        compare_drones(view.detections, pairs, index, found)
         flow = np.asarray(pairs["flow"][index], np.float32)
         valid = np.asarray(pairs["flow_valid"][index])
         first, second = (Frame("camera", images[k], 0.5 * k, k) for k in (0, 1))
@@ -203,14 +200,7 @@ def _masks(guess: Array, ids: Array, pairs: PairSet, index: int, found: Findings
         found.iou.append(float((mine & said).sum() / max((mine | said).sum(), 1)))
 
 
-def compare_drones(
-    detections: tuple[Detection, ...],
-    pairs: PairSet,
-    index: int,
-    depth: Array,
-    ids: Array,
-    found: Findings,
-) -> None:
+def compare_drones(detections: tuple[Detection, ...], pairs: PairSet, index: int, found: Findings) -> None:
     """Count every drone of a pair's first image: a detection is a drone's if it lies in its direction, at any range."""
     found.images += 1
     seen = np.flatnonzero(pairs["drone_pixels"][index, 0] >= MIN_PIXELS)
@@ -219,14 +209,13 @@ def compare_drones(
     detection_of = pairings(detections, places, sizes_m)
     for row, (drone, true) in enumerate(zip(seen, places, strict=True)):
         range_m, best = float(np.linalg.norm(true)), detection_of.get(row)
-        left, top, right, bottom = pairs["drone_box"][index, 0, drone]
-        inside = left > 1 and top > 1 and right < WIDTH - 1 and bottom < HEIGHT - 1
+        left, _, right, _ = pairs["drone_box"][index, 0, drone].tolist()
         error, sigma = 0.0, 1.0
         if best is not None:
             distance = float(np.linalg.norm(best.position))
             error, sigma = distance / range_m - 1.0, best.range_sigma_m / distance
-        whole = inside and _hidden_share(pairs, index, int(drone), depth, ids) < WHOLE_HIDES
-        found.drones.append(Drone(range_m, float(right - left), bool(whole), best is not None, error, sigma))
+        whole = bool(pairs["drone_whole"][index, 0, drone])
+        found.drones.append(Drone(range_m, right - left, whole, best is not None, error, sigma))
     found.false += len(detections) - len(detection_of)
 
 
@@ -248,21 +237,6 @@ def pairings(
 
 def _angle(a: Array, b: Array) -> float:
     return float(np.arccos(np.clip(a @ b / (np.linalg.norm(a) * np.linalg.norm(b)), -1, 1)))
-
-
-def _hidden_share(pairs: PairSet, index: int, drone: int, depth: Array, ids: Array) -> float:
-    """Share of the drone's convex outline in the image that something nearer hides."""
-    family = int(pairs["drone_family"][index, drone])
-    centre = np.asarray(pairs["drone_centre"][index, 0, drone], np.float64)
-    corners = drone_model(family, 0).vertices @ np.asarray(pairs["drone_rotation"][index, 0, drone], np.float64).T
-    half = float(pairs["focal"][index]) / 2
-    outline = outline_of(
-        corners + centre, np.array([[half, 0, WIDTH / 4], [0, half, HEIGHT / 4], [0, 0, 1]]), ids.shape
-    )
-    nearer = depth < centre[2] - SIZES_M[family] / 2
-    others = np.flatnonzero(pairs["drone_centre"][index, 0, :, 2] < centre[2]) + 1
-    nearer |= np.isin(ids, others)
-    return float((nearer & outline).sum() / max(int(outline.sum()), 1))
 
 
 if __name__ == "__main__":

@@ -33,7 +33,7 @@ ARRAYS: dict[str, tuple[tuple[int, ...], Any]] = {
     "R_ned_camera": ((2, 3, 3), np.float32),
     "height": ((2,), np.float32),
     "drone_centre": ((2, MAX_DRONES, 3), np.float32),  # camera axes, metres; NaN where there is none
-    "drone_rotation": ((2, MAX_DRONES, 3, 3), np.float32),  # camera axes from the drone's body
+    "drone_whole": ((2, MAX_DRONES), np.bool_),  # inside the image and not hidden
     "drone_pixels": ((2, MAX_DRONES), np.int32),  # visible, full-size pixels
     "drone_box": ((2, MAX_DRONES, 4), np.float32),  # full-size pixels
     "drone_family": ((MAX_DRONES,), np.int16),

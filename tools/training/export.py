@@ -2,8 +2,8 @@
 
     python -m tools.training.export neighbours --checkpoint RUNS/neighbours/checkpoint.pt --out models_of_mine --half
 
-Crops, thresholds, meanings and data are those of `--like`, by default of models/NETWORK.yaml. The flow is exported with
-one iteration: it trains with three, and DIS does the rest better.
+Crops, thresholds, meanings and data are those of models/NETWORK.yaml. The flow is exported with one iteration: it
+trains with three, and DIS does the rest better.
 """
 
 from __future__ import annotations
@@ -51,7 +51,6 @@ def main() -> None:
     parser.add_argument("network", choices=NETWORKS)
     parser.add_argument("--checkpoint", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--like", type=Path, help="manifest that says all that is not measured here")
     parser.add_argument("--half", action="store_true", help="store weights in 16 bits: half the file")
     with_its_start = "the run's start.pt: the mean of both weights is exported"
     parser.add_argument("--begun-with", type=Path, metavar="CHECKPOINT", help=with_its_start)
@@ -63,7 +62,7 @@ def main() -> None:
     trained.load_state_dict(state["net"])
     if arguments.begun_with:
         draw_back(trained, torch.load(arguments.begun_with, map_location="cpu")["net"], arguments.share)
-    like, _ = load_manifest(arguments.like or data_path("models") / f"{arguments.network}.yaml")
+    like, _ = load_manifest(data_path("models") / f"{arguments.network}.yaml")
     document = like.model_dump(mode="json", exclude_defaults=True) | {
         "name": arguments.network,
         "accuracy": {},

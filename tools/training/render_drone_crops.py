@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,8 +39,6 @@ PAINTED, SHAPES_PAINTED, OWN_PAINTED = 8, 3, 12
 MOST_DRONES = 3
 MIN_PIXELS = 8
 """Least visible pixels of a drone: one that is six pixels wide still differs from a bird."""
-HIDDEN_SHARE = 0.02
-"""Hidden share of its outline below which a drone is whole."""
 WITH_DISTRACTORS, DISTRACTOR_ALONE = 0.3, 0.1
 """Shares of the scenes: a bird or the like before or behind the drone, and in its place, where half are too far."""
 CUT_PX, FINER = 320, 3
@@ -76,7 +73,6 @@ def main() -> None:
     kind = parser.add_mutually_exclusive_group()
     kind.add_argument("--held-out", action="store_true", help="to measure on, of drones and worlds never learnt from")
     kind.add_argument("--cut-out", action="store_true", help="drones with transparent surroundings")
-    parser.add_argument("--processes", type=int, default=os.cpu_count())
     arguments = parser.parse_args()
     own = own_drone(parser, arguments)
     arguments.out.mkdir(parents=True, exist_ok=True)
@@ -89,7 +85,7 @@ def main() -> None:
         for seed, file in files.items()
         if not file.is_file()
     ]
-    worlds.in_processes(_cut_world if arguments.cut_out else _render_world, jobs, arguments.processes)
+    worlds.in_processes(_cut_world if arguments.cut_out else _render_world, jobs)
     if arguments.cut_out:
         names = sorted(file.name for file in arguments.out.glob("*.png"))
         (arguments.out / "index.jsonl").write_text("".join(json.dumps({"file": name}) + "\n" for name in names))
@@ -196,22 +192,9 @@ def _scene(
         samples = [sample_of(seen, crop, image, mine) for crop in crops]
     if not measures:
         return samples
-    whole = not alone and _is_whole(seen, view, matrix, (left, top))
+    corners = drones[0].vertices @ seen.rotation.T + seen.centre
+    whole = not alone and worlds.is_whole(corners, view, matrix, 1, drones[0].size_m, (left, top))
     return [{**s, "range_m": np.array(np.linalg.norm(seen.centre)), "whole": np.array(whole)} for s in samples]
-
-
-def _is_whole(drone: DroneInView, view: Any, matrix: Array, corner: tuple[int, int]) -> bool:
-    """Whether the drone is inside the image and hardly hidden; the view is the image's part from ``corner`` on."""
-    places = drone.model.vertices @ drone.rotation.T + drone.centre
-    if places[:, 2].min() < 0.05:
-        return False
-    pixels = places @ matrix.T
-    pixels = pixels[:, :2] / pixels[:, 2:] + corner
-    if (pixels < 1).any() or (pixels > (WIDTH - 1, HEIGHT - 1)).any():
-        return False
-    outline = worlds.outline_of(places, matrix, view.ids.shape)
-    before = (view.depth < drone.centre[2] - drone.model.size_m / 2) | (view.ids > 1)
-    return bool((before & outline).sum() < HIDDEN_SHARE * outline.sum())
 
 
 def _places(position: Array, R_ned_camera: Array, focal: float, count: int, rng: np.random.Generator) -> Array:

@@ -10,7 +10,6 @@ shapes. With ``--families unseen`` the drones are of the families that no networ
 from __future__ import annotations
 
 import argparse
-import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -46,7 +45,6 @@ def main() -> None:
     parser.add_argument("--worlds", type=int, default=120)
     parser.add_argument("--pairs", type=int, default=30, help="pairs a world")
     parser.add_argument("--obstacles", type=float, default=0.0, metavar="SHARE", help="of the worlds; default: none")
-    parser.add_argument("--processes", type=int, default=os.cpu_count())
     arguments = parser.parse_args()
     seeds = {"training": worlds.TRAINING, "validation": worlds.VALIDATION, "test": worlds.TEST}[arguments.split]
     families = {"training": worlds.FAMILIES, "unseen": worlds.UNSEEN_FAMILIES}[arguments.families]
@@ -56,7 +54,7 @@ def main() -> None:
         for i in range(arguments.worlds)
     ]
     missing = [job for job in jobs if not (job.folder / "made.json").is_file()]
-    worlds.in_processes(render_world, missing, arguments.processes)
+    worlds.in_processes(render_world, missing)
 
 
 @dataclass(frozen=True)
@@ -183,8 +181,14 @@ def _render_pair(
         part["ids"][index, k] = view.ids[1::2, 1::2]
         part["R_ned_camera"][index, k] = R_ned_camera
         part["height"][index, k] = -positions[k][2] - world.height_at(positions[k][:1], positions[k][1:2])[0]
-        _note_drones(part, index, k, view, R_ned_camera, positions[k], drone_positions[k], shown)
-        part["drone_rotation"][index, k] = R_ned_camera.T @ drone_rotations[k]
+        part["drone_centre"][index, k] = centres = (drone_positions[k] - positions[k]) @ R_ned_camera
+        for d in np.flatnonzero(shown).tolist():
+            rows, columns = np.nonzero(view.ids == d + 1)
+            part["drone_pixels"][index, k, d] = rows.size
+            if rows.size:
+                part["drone_box"][index, k, d] = columns.min(), rows.min(), columns.max() + 1, rows.max() + 1
+            corners = drones[d].vertices @ drone_rotations[k][d].T @ R_ned_camera + centres[d]
+            part["drone_whole"][index, k, d] = worlds.is_whole(corners, view, matrix, d + 1, drones[d].size_m)
     flow, valid = true_flow(
         views[0], views[1], matrix,
         R_ned_camera=(attitudes[0] @ R_BODY_CAMERA, attitudes[1] @ R_BODY_CAMERA),
@@ -196,19 +200,6 @@ def _render_pair(
     part["flow_valid"][index] = (valid & ~nobody[0])[1::2, 1::2]  # wings beat
     part["focal"][index] = focal
     part["drone_family"][index] = families
-
-
-def _note_drones(
-    part: dict[str, Array], index: int, k: int, view: Any, R_ned_camera: Array, position: Array, places: Array,
-    shown: Array,
-) -> None:  # fmt: skip
-    part["drone_centre"][index, k] = np.nan
-    for d in np.nonzero(shown)[0]:
-        part["drone_centre"][index, k, d] = R_ned_camera.T @ (places[d] - position)
-        rows, columns = np.nonzero(view.ids == d + 1)
-        part["drone_pixels"][index, k, d] = rows.size
-        if rows.size:
-            part["drone_box"][index, k, d] = columns.min(), rows.min(), columns.max() + 1, rows.max() + 1
 
 
 def _drone_places(position: Array, attitude: Array, focal: float, rng: np.random.Generator) -> Array:

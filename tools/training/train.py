@@ -48,14 +48,12 @@ def main() -> None:
     parser.add_argument("--rate", type=float, help="learning rate to begin with")
     parser.add_argument("--times", type=int, default=1, help="so many times as large batches, beside a GPU")
     parser.add_argument("--start", type=Path, help="weights to begin with: another run's checkpoint.pt, or an .onnx")
-    parser.add_argument("--threads", type=int, default=2, help="that learn, where there is no GPU")
     parser.add_argument("--workers", type=int, default=1, help="processes that draw samples")
-    parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     if arguments.network == "sigma" and arguments.start is None:
         parser.error("sigma needs the distance network that it belongs to, with --start")
-    torch.manual_seed(arguments.seed)
-    torch.set_num_threads(arguments.threads)
+    torch.manual_seed(0)
+    torch.set_num_threads(2)
     cv2.setNumThreads(1)
     try:
         task = TASKS[arguments.network](arguments.data)
@@ -67,29 +65,29 @@ def main() -> None:
     begun_with = arguments.out / "start.pt"
     if arguments.start and not begun_with.is_file():
         try:
-            start(task, arguments.start, arguments.seed)
+            start(task, arguments.start)
         except ValueError as error:
             raise SystemExit(f"--start: {error}") from None
         torch.save({"net": task.net.state_dict()}, begun_with)
     elif begun_with.is_file():
         task.go_on_from(torch.load(begun_with, map_location="cpu")["net"])
-    train(task, arguments.out, 60.0 * arguments.minutes, arguments.seed, arguments.workers)
+    train(task, arguments.out, 60.0 * arguments.minutes, arguments.workers)
 
 
-def start(task: Task, weights: Path, seed: int) -> None:
+def start(task: Task, weights: Path) -> None:
     """Give the task's network the weights of another run (.pt), or of an exported network (.onnx).
 
     Raises ValueError where an ONNX file is of another network.
     """
     if weights.suffix == ".onnx":
-        batch = _stack(task.batch_samples(np.random.default_rng(seed)))
+        batch = _stack(task.batch_samples(np.random.default_rng(0)))
         begin_with_onnx(task.net, weights, lambda: task.loss(batch))
         task.go_on_from(task.net.state_dict())
     else:
         task.go_on_from(torch.load(weights, map_location="cpu")["net"])
 
 
-def train(task: Task, out: Path, budget_s: float, seed: int, workers: int) -> None:
+def train(task: Task, out: Path, budget_s: float, workers: int) -> None:
     """Train for ``budget_s`` seconds with a cosine learning rate; ``workers`` processes draw the samples.
 
     The result is the mean of the weights over about the last thousand steps, which has less noise than those of a step.
@@ -111,7 +109,7 @@ def train(task: Task, out: Path, budget_s: float, seed: int, workers: int) -> No
     task.begin()
     last_save = last_print = spent
     recent: list[dict[str, float]] = []
-    upcoming = batches(task, [seed, step], workers)
+    upcoming = batches(task, [0, step], workers)
     while spent < budget_s:
         begin = time.monotonic()
         share = spent / budget_s

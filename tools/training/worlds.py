@@ -33,6 +33,8 @@ TEST = range(3_000_000, 4_000_000)
 FAMILIES = range(12)
 UNSEEN_FAMILIES = range(12, 14)
 SHAPES = range(400)
+HIDDEN_SHARE = 0.02
+"""Hidden share of its outline below which a drone is whole."""
 SHAPES_SHARE = 1 / 2
 """Share of the generator's shapes among the drones of training worlds, and among those that a training draws."""
 
@@ -50,11 +52,11 @@ def drawn_obstacles(seed: int, share: float) -> ObstaclesConfig | None:
     return ObstaclesConfig(kind="village", extent_m=extent_m, min_gap_m=gap_m, houses_per_hectare=houses)
 
 
-def in_processes(render: Callable[[Job], None], jobs: Sequence[Job], processes: int | None) -> None:
+def in_processes(render: Callable[[Job], None], jobs: Sequence[Job]) -> None:
     """Render each job's world in a process of its own; prints how many are done."""
     os.environ["NUMBA_NUM_THREADS"] = "1"
     begin = time.monotonic()
-    with multiprocessing.get_context("spawn").Pool(processes) as pool:
+    with multiprocessing.get_context("spawn").Pool() as pool:
         for done, _ in enumerate(pool.imap_unordered(render, jobs), start=1):
             print(f"{done}/{len(jobs)} worlds, {time.monotonic() - begin:.0f} s", flush=True)
 
@@ -70,13 +72,25 @@ def drawn_attitude(rng: np.random.Generator) -> NDArray[np.float64]:
     return attitude(rng.uniform(-np.pi, np.pi), rng.normal(0, np.radians(7), 2))
 
 
-def outline_of(corners: NDArray[Any], matrix: NDArray[Any], shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """(h, w) pixels within a thread around all points (n, 3) m, camera axes; ``matrix`` (3, 3) is its pinhole K."""
-    pixels = corners[corners[:, 2] > 0.05] @ matrix.T
-    hull = cv2.convexHull(np.round(pixels[:, :2] / pixels[:, 2:]).astype(np.int32))
-    outline = np.zeros(shape, np.uint8)
-    cv2.fillConvexPoly(outline, hull, 1)
-    return outline > 0
+def is_whole(
+    corners: Array, view: Any, matrix: Array, drone: int, size_m: float, begin: Sequence[int] = (0, 0)
+) -> bool:
+    """Whether a drone is inside the camera's image and hardly hidden.
+
+    ``corners`` (n, 3): of its mesh, camera axes, m; ``matrix`` (3, 3): the view's pinhole K; ``drone``: its id there;
+    ``begin``: column and row of the image where the view begins.
+    """
+    if corners[:, 2].min() < 0.05:
+        return False
+    pixels = corners @ matrix.T
+    pixels = pixels[:, :2] / pixels[:, 2:]
+    if (pixels + begin < 1).any() or (pixels + begin > (WIDTH - 1, HEIGHT - 1)).any():
+        return False
+    outline = np.zeros(view.ids.shape, np.uint8)  # as if a thread ran around it
+    cv2.fillConvexPoly(outline, cv2.convexHull(np.round(pixels).astype(np.int32)), 1)
+    middle_m = (corners[:, 2].min() + corners[:, 2].max()) / 2
+    before = (view.depth < middle_m - size_m / 2) | ((view.ids > 0) & (view.ids != drone))
+    return bool(np.count_nonzero(before & (outline > 0)) < HIDDEN_SHARE * np.count_nonzero(outline))
 
 
 @dataclass(frozen=True, eq=False)

@@ -65,7 +65,7 @@ def test_a_network_is_trained_resumed_exported_quantised_and_gone_on_from(tmp_pa
     for steps in (1, 2):
         task = FlowTask(data)
         task.batch = 2
-        train(task, run, spent_s + 1e-3, 0, 1)
+        train(task, run, spent_s + 1e-3, 1)
         state = torch.load(run / "checkpoint.pt")
         assert state["step"] == steps, "one more each time: resumed, not begun anew"
         assert state["spent"] > spent_s
@@ -82,10 +82,10 @@ def test_a_network_is_trained_resumed_exported_quantised_and_gone_on_from(tmp_pa
 
     further = FlowTask(data)
     further.batch = 2
-    start(further, models / "flow.onnx", 0)
+    start(further, models / "flow.onnx")
     before = further.net.sharpness.detach().clone()
     (tmp_path / "further").mkdir()
-    train(further, tmp_path / "further", 1e-3, 0, 1)
+    train(further, tmp_path / "further", 1e-3, 1)
     assert further.net.sharpness != before, "it learns on"
 
 

@@ -6,6 +6,7 @@ import argparse
 import json
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -118,6 +119,21 @@ def test_the_second_image_of_a_pair_is_where_the_flow_says_and_drones_are_in_the
             assert left - 1 <= columns.min() <= columns.max() <= right
             assert top - 1 <= rows.min() <= rows.max() <= bottom
     assert np.median(np.concatenate(off)) < 6.0
+
+
+def test_a_drone_is_whole_inside_the_image_and_behind_nothing() -> None:
+    """A box of 0.6 x 0.2 x 0.6 m, 4 m ahead; something else before it, its own pixels, and something at 2 m."""
+    corners = np.array([[x, y, 4.0 + z] for x in (-0.3, 0.3) for y in (-0.1, 0.1) for z in (-0.3, 0.3)])
+    lens = np.array([[FOCAL_PX, 0.0, WIDTH / 2], [0.0, FOCAL_PX, HEIGHT / 2], [0.0, 0.0, 1.0]])
+    view = SimpleNamespace(ids=np.zeros((HEIGHT, WIDTH), np.uint8), depth=np.full((HEIGHT, WIDTH), 50.0))
+    assert worlds.is_whole(corners, view, lens, 1, 0.6)
+    assert not worlds.is_whole(corners + np.array([4.2, 0.0, 0.0]), view, lens, 1, 0.6), "cut by the border"
+    view.ids[310:330, 230:250] = 2
+    assert not worlds.is_whole(corners, view, lens, 1, 0.6)
+    view.ids[view.ids == 2] = 1
+    assert worlds.is_whole(corners, view, lens, 1, 0.6)
+    view.depth[315:325, 235:245] = 2.0
+    assert not worlds.is_whole(corners, view, lens, 1, 0.6)
 
 
 def test_worlds_for_training_validation_test_and_flights_never_meet() -> None:
