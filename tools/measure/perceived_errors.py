@@ -15,8 +15,8 @@ ranges; `detector` and `verification` learnt some of the same public repositorie
 - **Detections are missed more often than tracks**, which bridge what is short: `missed` of `detections` has, at each
   distance (m), the share with which a drone's own tracker misses as many drones as `by_distance` says there; beyond the
   last all are missed. Other errors are of confirmed tracks; trackers pass on those that last.
-- **Ranges have one error at all distances**: of trained airframes that of 2 to 7 m is 3 to 6 %, of unknown ones that of
-  3 to 10 m 10 to 13 %. Nearer and farther ones are larger, but with tails that no normal error has, or few samples.
+- **Ranges have one error at all distances**: of trained airframes that of 2 to 5 m is 4 to 5 % and that of 5 to 10 m
+  9 to 10 %, of unknown ones that of 2 to 10 m 8 to 12 %. Nearer and farther there are few samples.
 
 Drones that others hide count as missed too.
 """
