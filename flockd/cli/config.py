@@ -141,11 +141,13 @@ def _check_file(file: Path, *, force: bool) -> None:
             complain(f"warning: {file}: {sentence}")
     else:
         from flockd.ground.doctor import Level
-        from flockd.ground.doctor.camera_checks import coverage, lens_problems
+        from flockd.ground.doctor.camera_checks import coverage, lens_problems, uncalibrated
 
         permit(outside_envelope(config, places), force=force)
         lenses = (one for camera in config.rig.cameras for one in lens_problems(camera))
-        for finding in (one for one in (coverage(config.rig), *lenses) if one.level is not Level.PASS):
+        for finding in (
+            one for one in (*uncalibrated(config), coverage(config.rig), *lenses) if one.level is not Level.PASS
+        ):
             complain(f"warning: {file}: {finding.about}: {finding.measured}; {finding.fix}")
 
 

@@ -75,6 +75,8 @@ def test_a_new_drones_devices_have_to_be_filled_in(tmp_path: Path, capsys: pytes
     assert "source.cameras[0].device: is yet to be filled in (CHANGE-ME); `flockd cameras --write FILE`" in told[0]
     file.write_text(file.read_text(encoding="utf-8").replace("CHANGE-ME", "usb"), encoding="utf-8")
     assert main(["config", "check", str(file)]) == 0
+    guessed = f"warning: {file}: cameras front, right, back, left: their lenses are not calibrated"
+    assert capsys.readouterr().err.startswith(guessed)
 
 
 def test_nothing_is_overwritten_without_force_nor_written_that_does_not_check(

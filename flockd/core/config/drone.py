@@ -121,11 +121,19 @@ class DroneConfig(Section):
             far_m = self.flocking.observation_distance_m
             told = f"is not below observation_distance_m {far_m:g}, beyond which no drone counts; write a smaller one"
             faults["flocking", "desired_distance_m"] = f"{self.flocking.desired_distance_m:g} {told}"
+        if (size_m := self.perception.drone_size_m) is not None and size_m >= (
+            apart_m := self.safety.gate.min_separation_m
+        ):
+            told = f"{apart_m:g} m is not above perception.drone_size_m {size_m:g}, at which drones touch"
+            faults["safety", "gate", "min_separation_m"] = f"{told}; write a larger one"
         if self.flocking.size == "learn" and self.perception.drone_size_m is not None:
             faults["flocking", "size"] = "learns what perception.drone_size_m says; delete one of the two"
         if self.speed_factor != 1.0 and self.autopilot is not None and self.autopilot.address.startswith("serial:"):
             fault = "is for simulations, and an autopilot on a cable is none; delete it"
             faults["source", "shared_memory", "speed_factor"] = fault
+        for key in () if self.source is None else ("set_tolerance_s", "set_wait_s"):
+            if (lasts_s := getattr(self.source, key)) > self.step_s:
+                faults["source", key] = f"{lasts_s:g} s is longer than step_s {self.step_s:g}; write a smaller one"
         if self.source is not None and self.source.kind != "shared_memory":
             faults |= self._device_faults(self.source.cameras)
             rate_hz = max(camera.rate_hz for camera in self.source.cameras) if self.source.cameras else 1e3

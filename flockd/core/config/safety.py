@@ -14,6 +14,9 @@ from flockd.core.navigation import crosses_itself, is_inside
 LOWEST_LAYER_M, LAYERS_APART_M = 3.0, 4.0
 """Distance of layers in first flights: `vertical_separation_m`, and a metre for errors of two drones' heights."""
 
+Celsius = Annotated[float, Field(ge=0, le=125)]
+"""No processor works hotter."""
+
 
 class GateParameters(Section):
     """The last limits on setpoints, whatever code requests them."""
@@ -101,9 +104,9 @@ class SafetyParameters(Section):
     """Degraded if the duration of steps (95th percentile) over the permitted duration is above this."""
     max_load: Positive = 2.0
     """Hover if it is above this."""
-    degraded_temperature_c: float = 85.0
+    degraded_temperature_c: Celsius = 85.0
     """Degraded from this temperature on, in the hottest thermal zone."""
-    max_temperature_c: float = 95.0
+    max_temperature_c: Celsius = 95.0
     """Hover from this temperature on."""
     max_loop_lag_s: Annotated[float, Field(gt=0, le=10)] = 0.2
     """Degraded if the event loop lags by more."""

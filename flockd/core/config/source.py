@@ -5,15 +5,26 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from flockd.core import services
 from flockd.core.choices import PixelFormat
 from flockd.core.config.base import Endpoint, Name, PlainName, Section, refuse, text
 from flockd.core.secrets import masked
 
-_TOPIC = r"^(/[A-Za-z_][A-Za-z0-9_]*)+$"
-"""A whole name of ROS 2."""
+Topic = Annotated[str, text(r"^(/[A-Za-z_][A-Za-z0-9_]*)+$", "a whole name of ROS 2, as in `/front/image_raw`")]
+
+
+def _linkable(pipeline: str) -> str:
+    """Raises ValueError for what is no pipeline to which a sink can be added."""
+    elements = [element.split() for element in pipeline.split("!")]
+    if not all(elements):
+        raise ValueError("has an element without a name; write one on both sides of each `!`")
+    if elements[0][0].startswith("gst-launch"):
+        raise ValueError(f"begins with {elements[0][0]}; write only what follows it")
+    if elements[-1][0].endswith("sink"):
+        raise ValueError(f"ends with {elements[-1][0]}, and flockd adds its own sink; delete it")
+    return pipeline
 
 
 class ControlParameters(Section):
@@ -38,11 +49,11 @@ class CameraDeviceParameters(Section):
         Annotated[str, text(r"^/dev/", "a device, as in `/dev/video0` or an entry of `/dev/v4l/by-path`")] | None
     ) = None
     """For kind `v4l2`: the path of the device, preferably one in /dev/v4l/by-path."""
-    pipeline: Annotated[str, Field(min_length=1)] | None = None
+    pipeline: Annotated[str, AfterValidator(_linkable)] | None = None
     """For kind `gstreamer`: a pipeline as for `gst-launch-1.0`, without a sink."""
-    topic: Annotated[str, Field(pattern=_TOPIC)] | None = None
+    topic: Topic | None = None
     """For kind `ros`: a topic of sensor_msgs/Image or CompressedImage, such as `/front/image_raw`."""
-    camera_info: Annotated[str, Field(pattern=_TOPIC)] | None = None
+    camera_info: Topic | None = None
     """For kind `ros`: topic of its CameraInfo, which must agree with the rig; by default `camera_info` beside the
     images."""
     stamps: Literal["system", "simulator"] = "system"

@@ -57,6 +57,7 @@ def check_cameras(
         watched = watch(sizes, source, seconds, devices or Devices(), start_s)
     for camera in config.rig.cameras:
         yield from _judged(camera, config, watched.get(camera.name))
+    yield from uncalibrated(config)
     yield coverage(config.rig)
 
 
@@ -85,6 +86,14 @@ def _judged(camera: CameraConfig, config: DroneConfig, watched: Watched | None) 
         size = "x".join(map(str, camera.size_px))
         measured.append(f"calibration fits {size}, {field_of_view_deg(camera.intrinsics, camera.size_px):.0f} degrees")
         yield passed(f"camera {camera.name}", ", ".join(measured))
+
+
+def uncalibrated(config: DroneConfig) -> Iterator[Finding]:
+    """Whether lenses of devices are as they came with a file, not as somebody measured them."""
+    names = [camera.name for camera in config.rig.cameras if camera.intrinsics.measured is None]
+    if names and config.source is not None and config.source.cameras:
+        about, fix = f"cameras {', '.join(names)}", "run `flockd calibrate camera`, and copy all of its `intrinsics`"
+        yield warned(about, "their lenses are not calibrated (no `intrinsics.measured`): ranges err as they do", fix)
 
 
 def _stream(name: str, watched: Watched, rate_hz: float, max_dropped_share: float, fix_rate: str) -> Iterator[Finding]:

@@ -196,6 +196,15 @@ def test_a_slip_in_line_six_is_reported_with_what_to_do(tmp_path: Path, line: st
             "1: step_s: is not given, and by default 0.5 s is above safety.gate.command_fresh_s 0.3",
         ),
         ("safety: {gate: {max_height_m: 0.5}}\nmission: {height_m: 5}", "6: safety.gate: min_height_m 1 is not below"),
+        # Of drones that are 3 m wide the tips meet where the middles are 3 m apart.
+        (
+            "perception: {drone_size_m: 3.0}",
+            "1: safety.gate.min_separation_m: is not given, and by default 1 m is not above perception.drone_size_m 3",
+        ),
+        (
+            "safety: {degraded_temperature_c: 70.0, max_temperature_c: 185.0}",
+            "6: safety.max_temperature_c: 185.0 is not at most 125; ",
+        ),
     ],
 )
 def test_a_default_that_does_not_fit_what_is_given_is_told_with_its_key(tmp_path: Path, line: str, told: str) -> None:

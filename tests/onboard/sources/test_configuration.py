@@ -148,6 +148,20 @@ SWAPPED = PIPELINES.replace("back, pipeline", "back, device").replace("lib", "/d
             "gstreamer\n" + PIPELINES.replace("libcamerasrc", "nvarguscamerasrc sensor-id=0"),
             "9: source.cameras[1].pipeline: two cameras share nvarguscamerasrc sensor-id=0; give each its own pipeline",
         ),
+        ("v4l2\n  set_tolerance_s: 20.0\n" + TWO, "7: source.set_tolerance_s: 20 s is longer than step_s 0.5; write "),
+        ("v4l2\n  set_wait_s: 33.0\n" + TWO, "7: source.set_wait_s: 33 s is longer than step_s 0.5; write a smaller"),
+        (
+            "ros\n" + TOPICS.replace("topic: /front", "topic: front"),
+            "8: source.cameras[0].topic: front/image_raw is not a whole name",
+        ),
+        *(
+            ("gstreamer\n" + PIPELINES.replace("libcamerasrc", wrong), f"9: source.cameras[1].pipeline: {told}; ")
+            for wrong, told in (
+                ("libcamerasrc ! autovideosink", "ends with autovideosink, and flockd adds its own sink"),
+                ("gst-launch-1.0 libcamerasrc", "begins with gst-launch-1.0"),
+                ("libcamerasrc !", "has an element without a name"),
+            )
+        ),
         ("v4l2\n  set_tolerance_s: 0.01\n" + TWO, "7: source.set_tolerance_s: 0.01 is less than half a frame period "),
         (
             "v4l2\n  silence_s: 0.05\n" + TWO,
