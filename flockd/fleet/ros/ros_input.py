@@ -69,12 +69,15 @@ def check_height(topic: str, kind: str, config: DroneConfig) -> None:
 
 
 def vehicle_state(kind: str, message: Any, time_s: float) -> VehicleState | None:
-    """The vehicle's state; None: the message has no orientation. The height of an attitude alone is 0.
+    """The vehicle's state; None: the message has no orientation or place, or axes that are not ROS's ENU and FLU. The
+    height of an attitude alone is 0.
 
     ``message``: of rclpy or `rosbags`, whose fields have the same names; ``kind``: one of `STATES`.
     """
     if kind in {PX4_ODOMETRY, PX4_ATTITUDE}:
         return _px4_state(kind, message, time_s)
+    if message.header.frame_id.endswith("_ned") or getattr(message, "child_frame_id", "").endswith("_frd"):
+        return None  # as MAVROS names PX4's axes
     pose = message.pose.pose if kind == ODOMETRY else message.pose if kind == POSE else message
     try:
         R_ned_body = attitude_of_ros(rotation_of(_values(pose.orientation, "xyzw")))

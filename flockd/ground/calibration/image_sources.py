@@ -11,7 +11,7 @@ from flockd.core.config import DroneConfig
 from flockd.core.errors import UnavailableError
 from flockd.core.messages import UInt8Array
 from flockd.ground.calibration.board import CalibrationError
-from flockd.ground.datasets.image_files import SUFFIXES, in_order, read_image, unread
+from flockd.ground.datasets.image_files import SUFFIXES, in_order, read_image, unread, visible
 from flockd.onboard.sources import FrameSource, open_source
 
 MOST_S = 120.0
@@ -35,8 +35,8 @@ class ImageStream:
 
 def from_folder(path: Path) -> ImageStream:
     """All images of a folder, by name. Raises CalibrationError if it has no images."""
-    files = in_order(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES and file.is_file())
-    if (others := unread(path.iterdir())) is not None:
+    files = in_order(file for file in visible(path) if file.suffix.lower() in SUFFIXES and file.is_file())
+    if (others := unread(visible(path))) is not None:
         raise CalibrationError(f"{path}: has {others}")
     if not files:
         raise CalibrationError(f"{path}: has no images; name the folder they are in")

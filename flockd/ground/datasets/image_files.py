@@ -42,6 +42,13 @@ _CHUNK_FRAME = 12
 """Bytes of a PNG chunk beside its data: length, name and checksum."""
 
 
+def visible(folder: Path, pattern: str = "*") -> list[Path]:
+    """What matches in a folder, without names that begin with a dot, and without what is below such a name: macOS lays
+    a `._` file beside each on a foreign disk, and viewers keep thumbnails in hidden folders."""
+    found = folder.glob(pattern)
+    return [one for one in found if not any(part.startswith(".") for part in one.relative_to(folder).parts)]
+
+
 def unread(files: Iterable[Path]) -> str | None:
     """A sentence about the pictures and videos among these that are not read, by kind; None: all are read."""
     files = list(files)

@@ -18,7 +18,15 @@ from flockd.core.config.rig import CameraConfig, IntrinsicsConfig
 from flockd.core.errors import ConfigError
 from flockd.core.messages import FloatArray, UInt8Array
 from flockd.flight.geometry import RigidTransform, ZMap
-from flockd.ground.datasets.image_files import SUFFIXES, DatasetError, in_order, read_depth, read_image, unread
+from flockd.ground.datasets.image_files import (
+    SUFFIXES,
+    DatasetError,
+    in_order,
+    read_depth,
+    read_image,
+    unread,
+    visible,
+)
 
 _UNITS_PER_M = 1000.0
 """Of depth maps, 16 bits a pixel."""
@@ -86,8 +94,8 @@ def open_dataset(path: Path) -> Dataset:
 
 
 def _files(folder: Path) -> list[Path]:
-    files = in_order(file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES)
-    if (others := unread(folder.iterdir())) is not None:
+    files = in_order(file for file in visible(folder) if file.suffix.lower() in SUFFIXES)
+    if (others := unread(visible(folder))) is not None:
         raise DatasetError(f"{folder}: has {others}")
     if not files:
         raise DatasetError(f"{folder}: holds no images; put them there")

@@ -20,6 +20,7 @@ from flockd.ground.datasets.image_files import (
     opened_video,
     read_image,
     unread,
+    visible,
 )
 
 
@@ -96,15 +97,15 @@ def find_pictures(
 
     ``left_out`` is called with a sentence about files of a folder that are not read.
 
-    In folders, names that begin with a dot and the contents of ``but_not``, a folder of copies, are ignored. Raises
-    UsageError for a path that does not exist, is neither image nor video, or is a folder without any.
+    In folders, hidden files and the contents of ``but_not``, a folder of copies, are ignored. Raises UsageError for a
+    path that does not exist, is neither image nor video, or is a folder without any.
     """
     endings = SUFFIXES | VIDEO_SUFFIXES
     copies = None if but_not is None else but_not.resolve()
     found: dict[Path, PictureFile] = {}
     for path in paths:
         if path.is_dir():
-            there = [one for one in path.rglob("[!.]*") if not one.is_dir()]
+            there = [one for one in visible(path, "**/*") if not one.is_dir()]
             if copies is not None and path.resolve() in copies.parents:
                 there = [one for one in there if not one.is_file() or copies not in one.resolve().parents]
             inside = in_order(one for one in there if one.suffix.lower() in endings and one.is_file())

@@ -26,7 +26,7 @@ Progress = Callable[[int, int], None]
 
 def recordings_in(folder: Path) -> tuple[Path, ...]:
     """The first file of each recording in a folder, by name. Raises RecordingError for other MCAP files."""
-    paths = sorted(folder.glob("*.mcap"))
+    paths = sorted(folder.glob("[!.]*.mcap"))  # macOS lays a `._` file beside each on a foreign disk
     return tuple(path for path in paths if head_of(path)[0].facts.get("part", "0") == "0")
 
 

@@ -100,7 +100,10 @@ def recording_of_bag(
         last_s = -np.inf
         for frames in _sets(bag, topics, config, began_ns, lost):
             vehicle = states.at(frames.time_s + config.rig.time_offset_s)
-            if vehicle is None or frames.time_s < last_s + config.step_s - source.set_tolerance_s:
+            if vehicle is None:
+                lost[f"all cameras: no state of the vehicle within {LONGEST_GAP_S:g} s"] += len(frames.frames)
+                continue
+            if frames.time_s < last_s + config.step_s - source.set_tolerance_s:
                 continue
             last_s = frames.time_s
             for entry in _entries(steps, frames, vehicle, lost):
@@ -208,12 +211,19 @@ class _PngFormat:
 def _states(bag: Bag, topic: str, config: DroneConfig, began_ns: int, tell: Callable[[str], None]) -> NearestState:
     """All states of the vehicle in the bag."""
     check_height(f"{bag.path}: {topic}", bag.kinds()[topic], config)
-    states, on_arrival = NearestState(kept=None), False
+    states, on_arrival, count, unusable = NearestState(kept=None), False, 0, 0
     for message in bag.messages([topic]):
         content = bag.read(message)
         stamp, own_clock = state_stamp_ns(message.kind, content, message.time_ns)
         on_arrival |= own_clock
-        states.add(vehicle_state(message.kind, content, _time_s(stamp, began_ns)))
+        state = vehicle_state(message.kind, content, _time_s(stamp, began_ns))
+        states.add(state)
+        count, unusable = count + 1, unusable + (state is None)
+    if unusable:
+        told = f"{bag.path}: {unusable} of {count} states of {topic} have no attitude or place in ENU and FLU"
+        if unusable == count:
+            raise RecordingError(f"{told}; name another topic with --vehicle")
+        tell(told)
     if on_arrival:
         tell(
             f"{bag.path}: stamps of {topic} are of the autopilot's own clock; the times at which it was recorded count"

@@ -13,8 +13,9 @@ import pytest
 
 from flockd.core.jpeg_header import jpeg_end, jpeg_size
 from flockd.core.messages import UInt8Array
+from flockd.ground.calibration.image_sources import from_folder
 from flockd.ground.datasets.image_files import DatasetError, in_order, read_image, unread
-from flockd.ground.datasets.image_folder import read_lines
+from flockd.ground.datasets.image_folder import open_dataset, read_lines
 from flockd.onboard.sources.image_formats import CorruptImageError, MjpegFormat
 
 HUGE = 60_000
@@ -152,3 +153,13 @@ def test_numbers_in_names_count_as_such() -> None:
     names = ["a/frame0.png", "a/frame2.png", "a/frame10.png", "b1/1.5.png", "b1/1.25.png", "b10/x.png"]
     ordered = ["a/frame0.png", "a/frame2.png", "a/frame10.png", "b1/1.25.png", "b1/1.5.png", "b10/x.png"]
     assert in_order(map(Path, names)) == list(map(Path, ordered))
+
+
+def test_what_macos_lays_beside_images_is_none(tmp_path: Path) -> None:
+    images = tmp_path / "images"
+    images.mkdir()
+    for name, data in (("0.png", _written(".png", 64, 48)), ("._0.png", b"\0\5\x16\7"), ("._1.heic", b"\0\5\x16\7")):
+        (images / name).write_bytes(data)
+    assert [name for name, _ in from_folder(images).images] == ["0.png"]
+    (tmp_path / "K.txt").write_text("60 0 31.5\n0 60 23.5\n0 0 1\n", encoding="utf-8")
+    assert [frame.image.name for frame, *_ in open_dataset(tmp_path).frames(with_depth=False)] == ["0.png"]

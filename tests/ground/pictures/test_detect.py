@@ -111,6 +111,8 @@ def test_a_known_size_gives_the_range(told: Told) -> None:
 def test_copies_show_what_was_found_and_nothing_is_lost(told: Told, tmp_path: Path) -> None:
     shutil.copy(NEAR, tmp_path / "a.jpg")
     (tmp_path / "._a.jpg").write_bytes(b"a note of another program")
+    (tmp_path / ".thumbnails").mkdir()
+    shutil.copy(NEAR, tmp_path / ".thumbnails" / "a.jpg")
     out = tmp_path / "drawn"
     for force in ((), ("--force",)):  # the second time, copies of before lie in the folder
         text = told(0, "detect", tmp_path, *FOV, "--out", out, *force)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -122,11 +124,12 @@ def bag(
     corner: tuple[int, int, int] | None = None,
     small: tuple[str, bytes] | None = None,
     focal_px: float | None = None,
+    spoil: Callable[[Any, int], Any] = lambda message, tick: message,
 ) -> Path:
     """A second of two cameras at 10 Hz, the second one 20 ms late, and states at 50 Hz.
 
     ``corner``: BGR of the first one's first pixel; ``small``: format and data of the second one's images; ``focal_px``:
-    of the first one's CameraInfo.
+    of the first one's CameraInfo; ``spoil``: of a state and its number, what is written; None: nothing.
     """
     with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         connections: dict[str, Any] = {}
@@ -145,7 +148,8 @@ def bag(
                     message = px4_odometry(own_us, np.array([0.04 * tick, 1.0, -3.0]))
                 else:
                     message = odometry(time_ns, place) if "Odom" in states else imu(time_ns)
-                write(topic, states, time_ns, message)
+                if (spoilt := spoil(message, tick)) is not None:
+                    write(topic, states, time_ns, spoilt)
             if tick % 5 == 0:
                 front = picture(tick, "front")
                 if corner is not None:
@@ -264,6 +268,34 @@ def test_images_that_cannot_be_used_are_counted_and_without_any_there_is_no_flig
     changes = {key: {**DRONE[key], "cameras": alone[key]} for key in alone}  # type: ignore[dict-item]
     with Bag(theirs) as opened, pytest.raises(RecordingError, match=f"none of its images could be used .{why}"):
         recording_of_bag(opened, load_drone(config_file(tmp_path, **changes)), None, tmp_path / "back.mcap")
+
+
+def in_ned(message: Any, tick: int) -> Any:
+    return replace(message, header=replace(message.header, frame_id="odom_ned"))
+
+
+def without_attitude(message: Any, tick: int) -> Any:
+    message.pose.pose.orientation.z = message.pose.pose.orientation.w = 0.0
+    return message
+
+
+@pytest.mark.parametrize("spoil", [in_ned, without_attitude])
+def test_states_that_are_none_are_told_instead_of_their_clocks(
+    tmp_path: Path, spoil: Callable[[Any, int], Any]
+) -> None:
+    theirs, config = bag(tmp_path / "bag", spoil=spoil), load_drone(config_file(tmp_path))
+    told = "bag: 50 of 50 states of /odom have no attitude or place in ENU and FLU; name another topic"
+    with Bag(theirs) as opened, pytest.raises(RecordingError, match=told):
+        recording_of_bag(opened, config, None, tmp_path / "flight.mcap")
+
+
+def test_images_without_a_state_are_counted(tmp_path: Path) -> None:
+    """States end at 0.5 s; from 0.7 s on no frame set has one."""
+    theirs, told = bag(tmp_path / "bag", spoil=lambda message, tick: message if tick <= 25 else None), list[str]()
+    with Bag(theirs) as opened:
+        recording_of_bag(opened, load_drone(config_file(tmp_path)), None, tmp_path / "flight.mcap", told.append)
+    why = "6 of all cameras: no state of the vehicle within 0.2 s"
+    assert told == [f"{theirs}: 6 images could not be used: {why}"]
 
 
 def test_a_part_of_a_bag_is_told_to_be_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

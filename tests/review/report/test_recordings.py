@@ -139,6 +139,7 @@ def text_of(page: Path) -> str:
 
 
 def test_a_flights_recordings_are_judged_by_the_truth_in_them(flight: Path) -> None:
+    (flight / "._a_copy_of_macos.mcap").write_bytes(b"\0\5\x16\7")
     log = log_of(*recordings_in(flight))
     summary = summarise(log)
     assert (summary["drones"], summary["has_truth"], summary["recorded"]) == (2, True, list(NAMES))
