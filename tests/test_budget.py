@@ -20,12 +20,12 @@ from flockd.onboard.recording.reader import Recording
 
 ROOT = Path(__file__).parents[1]
 LINES = {
-    "flockd/core": 3_290,
+    "flockd/core": 3_310,
     "flockd/flight": 9_840,
     "flockd/onboard": 9_250,
-    "flockd/fleet": 2_700,
-    "flockd/ground": 5_280,
-    "flockd/review": 3_550,
+    "flockd/fleet": 2_710,
+    "flockd/ground": 5_310,
+    "flockd/review": 3_560,
     "flockd/sim": 8_930,
     "flockd/campaign": 1_450,
     "flockd/cli": 3_830,

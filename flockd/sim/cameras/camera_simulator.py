@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import cv2
@@ -93,7 +93,7 @@ class CameraSimulator:
         self._scenario, self._image_noise = scenario, 0.0 if by_gain else scenario.sensors.image_noise
         self.begin_again()
         count = os.cpu_count() if threads is None else threads
-        self._executor = ThreadPoolExecutor(count, thread_name_prefix="camera") if count else None
+        self._map = ThreadPoolExecutor(count, thread_name_prefix="camera").map if count else map
 
     def begin_again(self) -> None:
         """Resets noise, clocks and poses for another flight in the same world."""
@@ -111,8 +111,8 @@ class CameraSimulator:
     def capture(
         self, drone: int, step: int, time_s: float, vehicles: FlockPose | Vehicles, trail: PoseTrail | None = None,
         disturbed: Disturbances = UNDISTURBED,
-    ) -> FrameSet:  # fmt: skip
-        """The frame set of one drone, from 0, at a step.
+    ) -> Callable[[], FrameSet]:  # fmt: skip
+        """Draws the images of one drone, from 0, at a step; the result waits for its frame set. Call results in order.
 
         ``trail``: the flock's poses until now, for late images and for motion; None: the poses of earlier captures,
         between which motion is taken as even. ``disturbed``: cameras that are off and drones that were removed.
@@ -149,16 +149,19 @@ class CameraSimulator:
             sun = self._world.light[0] @ turns[name]
             return self._real[drone, name].image(seen, motion, sun)
 
-        # Side by side; noise is drawn in the cameras' order, so that the images do not depend on that.
-        drawn = map(sensed_by, cameras) if self._executor is None else self._executor.map(sensed_by, cameras)
-        frames = {}
-        for name, sensed in zip(cameras, drawn, strict=True):
-            image = self._noise.add(sensed)
-            if self._real is not None:
-                image = self._real[drone, name].compressed(image)
-            if shots[name].comes and name not in off:
-                frames[name] = Frame(name, image, shots[name].stamp_s, step)
-        return FrameSet(time_s, frames)
+        drawn = self._map(sensed_by, cameras)
+
+        def frame_set() -> FrameSet:
+            frames = {}  # side by side; noise is drawn in their order, so that the images do not depend on that
+            for name, sensed in zip(cameras, drawn, strict=True):
+                image = self._noise.add(sensed)
+                if self._real is not None:
+                    image = self._real[drone, name].compressed(image)
+                if shots[name].comes and name not in off:
+                    frames[name] = Frame(name, image, shots[name].stamp_s, step)
+            return FrameSet(time_s, frames)
+
+        return frame_set
 
     def _turn(self, drone: int, name: str, shot: Shot, flock: FlockPose | Vehicles) -> FloatArray:
         """(3, 3) from a camera's axes to NED, shaken."""

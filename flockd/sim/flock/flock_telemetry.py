@@ -258,7 +258,7 @@ class _DrawnOnRequest:
             (step, poses), known = self.newest, self._frames.get(drone)
             if known is None or known.time_s != poses.time_s:
                 cameras, time_s = self._cameras.result(), poses.time_s
-                self._frames[drone] = cameras.capture(drone, step, time_s, poses, disturbed=self.disturbed)
+                self._frames[drone] = cameras.capture(drone, step, time_s, poses, disturbed=self.disturbed)()
             return self._frames[drone]
 
     def begin_again(self) -> None:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import partial
 
 import numpy as np
 
@@ -78,8 +76,8 @@ def fly(
         shown: where every drone's output is published; operators' orders come from there. A flight on exact states then
             takes as long as it takes in the air.
         recorders: one a drone, or none.
-        threads: for pilots that see, and as many for their images; 0: all on the calling one; None: as many as there
-            are processors.
+        threads: for images; 0: all on the calling one, pilots too; None: as many as there are processors. Pilots that
+            see step all at once.
         models: what each drone looks like; None: as the scenario says.
         pictured: keep key frames for the report.
         progress: called with (steps done, steps in all).
@@ -210,7 +208,7 @@ class VisionPilots:
         companion: tuple[FloatArray, FloatArray] | None = None,
         threads: int | None = None,
     ) -> None:
-        """For a flight from the beginning. Pilots step on ``threads`` while the next images are drawn, see `fly`.
+        """For a flight from the beginning. ``threads``: 0: pilots step on the calling one; else each on its own.
 
         ``companion``: for what is recorded; None where nothing is.
         """
@@ -222,8 +220,8 @@ class VisionPilots:
         self._pilots = {
             i: FlockPilot(scenario.drone_of(i), networks, stopwatch=time.perf_counter) for i in self._drones
         }
-        count = os.cpu_count() if threads is None else threads
-        self._executor = ThreadPoolExecutor(count, thread_name_prefix="pilot") if count else None
+        # All at once, as then they end together, and one waits for Python's lock while others compute.
+        self._map = map if threads == 0 else ThreadPoolExecutor(len(scenario.vehicles), thread_name_prefix="pilot").map
         ground = cameras.ground_height
         self._autopilots = {
             i: SimulatedAutopilot(scenario.sensors, seed=scenario.seed, drone=i, ground=ground) for i in self._drones
@@ -241,27 +239,27 @@ class VisionPilots:
         pictured: bool,
         disturbed: Disturbances = UNDISTURBED,
     ) -> Commands:
-        """Commands for all drones. Each pilot steps once its images are drawn. ``builder``: see `ExactStatePilots`."""
-        steps, render_ms = {}, {}
+        """Commands for all drones, whose pilots step once all images are drawn. ``builder``: see `ExactStatePilots`."""
         flying = [i for i in self._drones if i not in disturbed.removed]
         orders = {} if self._shown is None else self._shown.take_orders(flying)
         turn_rates = vehicles.trail.motion_at(time_s).turn
-        for i in flying:
-            begin = time.perf_counter()
-            frames = self._cameras.capture(i, step, time_s, vehicles, vehicles.trail, disturbed)
-            render_ms[i] = 1e3 * (time.perf_counter() - begin)
-            state = self._autopilots[i].read(
+        begin = time.perf_counter()
+        drawing = [self._cameras.capture(i, step, time_s, vehicles, vehicles.trail, disturbed) for i in flying]
+        sets = [frame_set() for frame_set in drawing]
+        render_ms = 1e3 * (time.perf_counter() - begin) / max(len(flying), 1)
+        states = [
+            self._autopilots[i].read(
                 time_s, vehicles.position[i], vehicles.velocity[i], vehicles.R_ned_body[i], turn_rates[i],
                 vehicles.errors[i] if vehicles.errors else None,
-            )  # fmt: skip
-            with_pictures = pictured and i in self._drones[:_KEY_FRAME_DRONES]
-            stepping = partial(self._step, i, frames, state, with_pictures, orders.get(i))
-            steps[i] = frames, state, stepping if self._executor is None else self._executor.submit(stepping).result
+            )
+            for i in flying
+        ]  # fmt: skip
+        with_pictures = [pictured and i in self._drones[:_KEY_FRAME_DRONES] for i in flying]
+        results = self._map(self._step, flying, sets, states, with_pictures, map(orders.get, flying))
         outputs: dict[int, PilotOutput] = {}
         self.key_frames = []
         truth = None if self._companion is None else self._truth(step, time_s, vehicles, self._companion)
-        for i, (frames, state, result) in steps.items():
-            output, seen = result()
+        for i, frames, state, (output, seen) in zip(flying, sets, states, results, strict=True):
             outputs[i] = output
             self.key_frames += seen
             if self._shown is not None:
@@ -271,7 +269,7 @@ class VisionPilots:
                 recorder.drain()  # simulated time stands still, so nothing need ever be dropped
                 recorder.step(frames, state, output, truth, orders.get(i))
             if builder is not None:
-                builder.add_output(step, i, output, {"render": render_ms[i], **output.stages_ms})
+                builder.add_output(step, i, output, {"render": render_ms, **output.stages_ms})
         return self._commands(time_s, vehicles, outputs)
 
     def _step(

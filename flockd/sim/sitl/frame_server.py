@@ -71,7 +71,7 @@ class FrameServer:
         for i, drone in enumerate(self._drones):
             if drone is None:
                 continue
-            frames = self._cameras.capture(i, number, poses.time_s, poses)
+            frames = self._cameras.capture(i, number, poses.time_s, poses)()
             for frame in frames.frames.values():
                 self._publisher.publish(drone, frame)
         self._frames.append(poses)

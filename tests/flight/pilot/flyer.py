@@ -79,7 +79,7 @@ class Flyer:
         return Perception(self.cameras.rig, self.truth, config)
 
     def take_frames(self) -> tuple[FrameSet, VehicleState]:
-        frames = self.cameras.capture(0, self.steps, self.time_s, self.vehicles)
+        frames = self.cameras.capture(0, self.steps, self.time_s, self.vehicles)()
         v = self.vehicles
         return frames, VehicleState(self.time_s, v.R_ned_body[0], -float(v.position[0, 2]), v.velocity[0])
 

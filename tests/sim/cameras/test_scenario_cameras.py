@@ -45,7 +45,7 @@ def flown_frames(scenario: ScenarioConfig, threads: int = 0, steps: int = 3) -> 
     simulator, vehicles = CameraSimulator(scenario, threads), Vehicles(scenario.vehicles, scenario.vehicle)
     seen = []
     for step in range(steps):
-        seen.append(dict(simulator.capture(0, step, 0.5 * step, vehicles, vehicles.trail).frames))
+        seen.append(dict(simulator.capture(0, step, 0.5 * step, vehicles, vehicles.trail)().frames))
         vehicles.step(np.array([[1.0, 0.5], [1.0, 0.0]]), np.array([0.6, 0.0]), 0.5)
     return seen
 
@@ -92,9 +92,9 @@ def test_a_late_image_is_that_of_before_under_its_own_stamp() -> None:
     yaws = np.array([0.6, 0.0])
     for _ in range(2):
         vehicles.step(np.array([[1.0, 0.5], [1.0, 0.0]]), yaws, 0.5)
-    before = simulator.capture(0, 0, 0.8, vehicles.trail.at(0.8)).frames["front"].image
+    before = simulator.capture(0, 0, 0.8, vehicles.trail.at(0.8))().frames["front"].image
     assert np.array_equal(late.image, before)
-    assert not np.array_equal(late.image, simulator.capture(0, 0, 1.0, vehicles).frames["front"].image)
+    assert not np.array_equal(late.image, simulator.capture(0, 0, 1.0, vehicles)().frames["front"].image)
 
 
 def test_images_that_never_come_are_missing() -> None:
