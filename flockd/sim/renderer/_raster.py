@@ -262,23 +262,21 @@ def _put(rgb: Any, y: Any, x: Any, packed: Any) -> None:
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def shade_scene(hit: Any, planes: Any, eye: Any, scene: Any, blobs: Any, rgb: Any, depth: Any) -> None:
-    """Colour and metric depth of every pixel from its triangle index, inf for sky.
+def shade_scene(hit: Any, planes: Any, eye: Any, scene: Any, blobs: Any, shown: Any, depth: Any) -> None:
+    """Colour, packed, and metric depth of every pixel from its triangle index, inf for sky.
 
     ``blobs`` (k, 9): a drone's place, radius and darkness; left, top, right and bottom of where its shadow may be.
     """
     width, tone, blobs = hit.shape[1], scene.tone.astype(i32), blobs.astype(f32)
-    columns, shown, free = np.empty((3, width), dtype=u32), np.empty(width, dtype=u32), np.empty(width, dtype=f32)
+    columns, free = np.empty((3, width), dtype=u32), np.empty(width, dtype=f32)
     skies, grounds, things = columns[0], columns[1], columns[2]
     eye = Eye(eye.K, eye.inverse_K, eye.R, eye.origin, 2.0**0.4 * eye.focal)  # a little sharper
     for y in range(hit.shape[0]):
         m, g, k = _sort(hit[y], planes, scene.faces, y + 0.5, depth[y], skies, grounds, things)
         _cast_shadows(blobs, scene.light[0], eye, y, depth[y], free)
-        _shade_sky(skies[:m], eye, y, scene.sky, tone, shown)
-        _shade_ground(grounds[:g], eye, y, (hit[y], depth[y], free), scene, tone, shown)
-        _shade_things(things[:k], eye, y, (hit[y], depth[y], free), scene, tone, shown)
-        for x in range(width):
-            _put(rgb, y, x, shown[x])
+        _shade_sky(skies[:m], eye, y, scene.sky, tone, shown[y])
+        _shade_ground(grounds[:g], eye, y, (hit[y], depth[y], free), scene, tone, shown[y])
+        _shade_things(things[:k], eye, y, (hit[y], depth[y], free), scene, tone, shown[y])
 
 
 @_loop
@@ -407,13 +405,14 @@ def smooth_edges(hit: Any, grounds: int, planes: Any, linear: Any, tone: Any, sh
     """Blend colours along edges by coverage: four samples in a pixel ask which of the 3x3 pixels' triangles covers it.
 
     A sample takes the colour of the pixel where its triangle was seen, so nothing is shaded twice. The first
-    ``grounds`` triangles are the ground. ``rgb`` comes as a copy of ``sharp``.
+    ``grounds`` triangles are the ground. ``sharp`` (h, w, 4) has a byte more than ``rgb``, which comes as its copy.
     """
     height, width = hit.shape
-    marked, near, row, column = np.empty(width, u32), np.empty(9, i32), np.empty(9, i32), np.empty(9, i32)
+    words, marked = np.zeros(-(-width // 8), np.uint64), np.empty(width + 1, u32)
+    near, row, column = np.empty(9, i32), np.empty(9, i32), np.empty(9, i32)
     for y in range(height):
         above, below = hit[max(0, y - 1)], hit[min(height - 1, y + 1)]
-        for x in marked[: _mark_edges(grounds, hit[y], above, below, marked)]:
+        for x in marked[: _mark_edges(grounds, hit[y], above, below, words, marked)]:
             t, edge = hit[y, x], False
             for k in range(4):
                 i, j = x + (k == 0) - (k == 1), y + (k == 2) - (k == 3)
@@ -447,16 +446,20 @@ def smooth_edges(hit: Any, grounds: int, planes: Any, linear: Any, tone: Any, sh
 
 
 @_loop
-def _mark_edges(grounds: int, row: Any, above: Any, below: Any, marked: Any) -> Any:
-    """In how many places a row differs from its pixel beside, above or below, and where."""
-    count, before = 0, row[0]
+def _mark_edges(grounds: int, row: Any, above: Any, below: Any, words: Any, marked: Any) -> Any:
+    """In how many places a row differs from its pixel beside, above or below, and where; ``words`` have 8 of each."""
+    differs, count = words.view(np.bool_), 0
     for x in range(row.shape[0]):
-        t, after = row[x], row[min(x + 1, row.shape[0] - 1)]
-        if t != before or t != after or t != above[x] or t != below[x]:  # seldom
-            beside = _differ(grounds, t, before) | _differ(grounds, t, after)
-            marked[count] = x
-            count += beside | _differ(grounds, t, above[x]) | _differ(grounds, t, below[x])
-        before = t
+        differs[x] = _differ(grounds, row[x], above[x]) | _differ(grounds, row[x], below[x])
+    for x in range(1, row.shape[0]):
+        differs[x] |= _differ(grounds, row[x], row[x - 1])
+    for x in range(row.shape[0] - 1):
+        differs[x] |= _differ(grounds, row[x], row[x + 1])
+    for word in range(words.shape[0]):
+        if words[word]:  # seldom
+            for x in range(8 * word, 8 * word + 8):
+                marked[count] = x
+                count += differs[x]
     return count
 
 

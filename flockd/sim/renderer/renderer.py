@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -74,11 +75,12 @@ class Renderer:
         P = np.ascontiguousarray(K @ R.T)
 
         blobs = self._shadows(positions, P, origin, width, height)
-        depth = np.empty((height, width), dtype=np.float32)
-        sharp = np.empty((height, width, 3), dtype=np.uint8)
-        planes, hit, _ = rasterized(world.vertices, world.triangles, P, origin, width, height)
-        _raster.shade_scene(hit, planes, eye, self._scene, blobs, sharp, depth)
-        view = View(rgb=sharp.copy(), depth=depth, ids=np.zeros((height, width), dtype=np.uint8))
+        planes, hit, depth = rasterized(world.vertices, world.triangles, P, origin, width, height)
+        packed = np.empty((height, width), dtype=np.uint32)
+        _raster.shade_scene(hit, planes, eye, self._scene, blobs, packed, depth)
+        sharp = packed.view(np.uint8).reshape(height, width, 4)
+        rgb = np.asarray(cv2.cvtColor(sharp, cv2.COLOR_RGBA2RGB), np.uint8)
+        view = View(rgb, depth, ids=np.zeros((height, width), dtype=np.uint8))
         _raster.smooth_edges(hit, self._grounds, planes, self._linear, world.tone, sharp, view.rgb)
         chosen = np.arange(count)[np.asarray(shown)] if len(np.asarray(shown)) else np.arange(0)
         away_m = np.array([np.linalg.norm(positions[k] - origin) for k in chosen])

@@ -9,7 +9,7 @@ import pytest
 from numba import njit
 from numpy.typing import NDArray
 
-from flockd.core.messages import Float32Array, FloatArray, UInt8Array
+from flockd.core.messages import FloatArray, UInt8Array
 from flockd.sim.renderer import _raster
 from flockd.sim.renderer.renderer import rasterized, scene_of
 from flockd.sim.world import textures
@@ -41,13 +41,13 @@ class Shot:
         self.world, self.R, self.origin, self.drones = world, np.ascontiguousarray(R), origin, drones
         self.inverse_K: FloatArray = np.linalg.inv(K)
         P = np.ascontiguousarray(K @ self.R.T)
-        self.planes, self.hit, _ = rasterized(world.vertices, world.triangles, P, origin, width, height)
-        self.rgb: UInt8Array = np.empty((height, width, 3), np.uint8)
-        self.depth: Float32Array = np.empty((height, width), np.float32)
+        self.planes, self.hit, self.depth = rasterized(world.vertices, world.triangles, P, origin, width, height)
+        packed = np.empty((height, width), np.uint32)
         everywhere = np.tile([0.0, 0.0, width, height], (len(drones), 1))
         eye = _raster.Eye(K, self.inverse_K, self.R, origin, math.sqrt(K[0, 0] * K[1, 1]))
         blobs = np.hstack([drones, everywhere])
-        _raster.shade_scene(self.hit, self.planes, eye, scene_of(world), blobs, self.rgb, self.depth)
+        _raster.shade_scene(self.hit, self.planes, eye, scene_of(world), blobs, packed, self.depth)
+        self.rgb: UInt8Array = packed.view(np.uint8).reshape(height, width, 4)[..., :3]
 
     def expected(self, y: int, x: int) -> tuple[float, list[int]]:
         """Depth and colour of one pixel, in float64, with the library's logarithms."""
