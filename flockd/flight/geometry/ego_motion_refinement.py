@@ -29,7 +29,7 @@ _UNSEEN_PX = 1e3
 _MOST_STEPS, _SETTLED = 20, 1e-4
 """Largest number of Gauss-Newton steps, and size of a step, in radians and metres, at which they end."""
 _OBSERVABLE = 1e-12
-"""Least singular value of the normal equations, relative to the largest; in other directions the motion stays as it is."""
+"""Least singular value of the normal equations, relative to the largest; in other directions the motion stays."""
 
 
 def refine_ego_motion(pairs: PointPairs, rig: Rig, initial: RigidTransform, agreeing: BoolArray) -> RigidTransform:
