@@ -88,7 +88,7 @@ def test_a_jpeg_that_takes_long_for_its_many_scans_is_refused_before_it_is_decod
     with pytest.raises(DatasetError, match=rf"scans of {side} x {side} pixels, more than any camera writes"):
         read_image(path)
     with pytest.raises(CorruptImageError, match="scans of"):
-        MjpegFormat((side, side)).decode(path.read_bytes())
+        MjpegFormat((side, side)).pixels(path.read_bytes())
     path.write_bytes(bytes(data))
     assert read_image(path).shape == (side, side, 3), "as an encoder writes it, it is read"
 

@@ -58,7 +58,7 @@ def test_without_cameras_and_with_ideal_ones_an_image_is_the_view_as_it_is_drawn
     """Drawn here once more by the renderer alone."""
     scenario = scenario_with(None, image_noise=0.0)
     simulator, vehicles = CameraSimulator(scenario, 0), Vehicles(scenario.vehicles, scenario.vehicle)
-    frames = simulator.capture(0, 0, 0.0, vehicles, vehicles.trail).frames
+    frames = simulator.capture(0, 0, 0.0, vehicles, vehicles.trail)().frames
     for name, mounted in build_rig(scenario.drone.rig).cameras.items():
         turn = vehicles.R_ned_body[0] @ mounted.T_body_camera.rotation
         place = vehicles.position[0] + vehicles.R_ned_body[0] @ mounted.T_body_camera.translation

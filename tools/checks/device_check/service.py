@@ -206,7 +206,7 @@ class Service:
             f"exit 0 within {STOPPED_S:g} s, the autopilot holds", row=27,
         )  # fmt: skip
         recording = Recording(max(RECORDINGS.glob("*.mcap"), key=lambda path: path.stat().st_mtime))
-        decode = MjpegFormat(FRONT_SIZE).decode
+        decode = MjpegFormat(FRONT_SIZE).pixels
         known = {decode(image(FRONT_SIZE, number)).tobytes() for number in range(COUNT)}
         seen = [step.frames.frames["front"].image for step in recording.steps() if "front" in step.frames.frames]
         equal = sum(np.ascontiguousarray(one).tobytes() in known for one in seen)
