@@ -131,9 +131,9 @@ class DroneConfig(Section):
         if self.speed_factor != 1.0 and self.autopilot is not None and self.autopilot.address.startswith("serial:"):
             fault = "is for simulations, and an autopilot on a cable is none; delete it"
             faults["source", "shared_memory", "speed_factor"] = fault
-        for key in () if self.source is None else ("set_tolerance_s", "set_wait_s"):
-            if (lasts_s := getattr(self.source, key)) > self.step_s:
-                faults["source", key] = f"{lasts_s:g} s is longer than step_s {self.step_s:g}; write a smaller one"
+        if self.source is not None and (apart_s := self.source.set_tolerance_s) > self.step_s:
+            told = f"{apart_s:g} s is longer than step_s {self.step_s:g}; write a smaller one"
+            faults["source", "set_tolerance_s"] = told
         if self.source is not None and self.source.kind != "shared_memory":
             faults |= self._device_faults(self.source.cameras)
             rate_hz = max(camera.rate_hz for camera in self.source.cameras) if self.source.cameras else 1e3

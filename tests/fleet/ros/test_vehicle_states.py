@@ -18,16 +18,17 @@ def _three(x: float, y: float, z: float) -> SimpleNamespace:
     return SimpleNamespace(x=x, y=y, z=z)
 
 
-def _message(kind: str, covariance: float = 0.0, w: float = math.cos(math.pi / 4)) -> Any:
+def _message(kind: str, covariance: float = 0.0, w: float = math.cos(math.pi / 4), frame: str = "odom") -> Any:
     """Facing north in ENU, 3 m east, 4 m north and 5 m up; ahead at 2 m/s, to the left at 1, up at 0.5."""
     turn = SimpleNamespace(x=0.0, y=0.0, z=math.sin(math.pi / 4) if w else 0.0, w=w)
-    pose = SimpleNamespace(orientation=turn, position=_three(3.0, 4.0, 5.0))
+    header = SimpleNamespace(frame_id=frame)
+    pose = SimpleNamespace(orientation=turn, position=_three(3.0, 4.0, 5.0), header=header)
     if kind == IMU:
         return pose
     if kind == POSE:
-        return SimpleNamespace(pose=pose)
+        return SimpleNamespace(pose=pose, header=header)
     twist = SimpleNamespace(twist=SimpleNamespace(linear=_three(2.0, 1.0, 0.5)), covariance=[covariance])
-    return SimpleNamespace(pose=SimpleNamespace(pose=pose), twist=twist)
+    return SimpleNamespace(pose=SimpleNamespace(pose=pose), twist=twist, header=header)
 
 
 def test_an_odometry_is_the_whole_state() -> None:
@@ -51,6 +52,7 @@ def test_what_nobody_filled_in_is_not_taken() -> None:
     assert unknown is not None
     assert unknown.velocity_ned is None
     assert vehicle_state(POSE, _message(POSE, w=0.0), 7.0) is None
+    assert vehicle_state(POSE, _message(POSE, frame="odom_ned"), 7.0) is None, "PX4's axes, as MAVROS names them"
 
 
 @pytest.mark.parametrize(("stamp_us", "true_ns"), [(1_000_000_200_000, 1_000_000_200_000_000), (7_000_000, 10**15)])

@@ -149,7 +149,6 @@ SWAPPED = PIPELINES.replace("back, pipeline", "back, device").replace("lib", "/d
             "9: source.cameras[1].pipeline: two cameras share nvarguscamerasrc sensor-id=0; give each its own pipeline",
         ),
         ("v4l2\n  set_tolerance_s: 20.0\n" + TWO, "7: source.set_tolerance_s: 20 s is longer than step_s 0.5; write "),
-        ("v4l2\n  set_wait_s: 33.0\n" + TWO, "7: source.set_wait_s: 33 s is longer than step_s 0.5; write a smaller"),
         (
             "ros\n" + TOPICS.replace("topic: /front", "topic: front"),
             "8: source.cameras[0].topic: front/image_raw is not a whole name",
