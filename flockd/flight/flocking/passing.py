@@ -24,6 +24,9 @@ _COMES_M_S, _COMES_S = 0.5, 2 * HORIZON_S
 """Least closing speed of a neighbour that the drone sidesteps instead of backing off, and time within which it would be
 too near."""
 
+_Plane = tuple[FloatArray, float, float]
+"""A half-plane of velocities, see `_half_plane`."""
+
 
 class Passing:
     """One drone's passing of its neighbours: it keeps the side of each until it has passed.
@@ -74,31 +77,39 @@ class Passing:
         collision avoidance", 2011): each neighbour permits one half-plane of velocities, so that the distance is kept
         for `HORIZON_S` if both take their share. One that is nearer already may come no nearer, and the law separates
         them. Without conflict the result is `wanted`. A half-plane is violated where satisfying it would take more than
-        1 / `_SHARE` times as much change of velocity.
+        1 / `_SHARE` times as much change of velocity; then the other side of each neighbour is tried too: between two
+        that come from opposite directions the usual sides are opposite, and the drone would stay in the middle.
         """
         distance_m, max_speed_m_s = self._law.parameters.separation_distance_m, self._law.parameters.max_speed_m_s
         ranges = np.hypot(offsets[:, 0], offsets[:, 1])
         near = np.flatnonzero((np.abs(offsets[:, 2]) < self._vertical_m) & (ranges > SAME_SPOT_M)).tolist()
-        sides = {one: self._sides.get(tracks[one], 0.0) for one in near}
-        planes = {
-            one: _half_plane(velocity, offsets[one, :2], velocity - velocities[one], distance_m, side)
-            for one, side in sides.items()
-        }
+
+        def plane(one: int, side: float) -> _Plane:
+            return _half_plane(velocity, offsets[one, :2], velocity - velocities[one], distance_m, side)
+
+        planes = {one: plane(one, self._sides.get(tracks[one], 0.0)) for one in near}
+        clear, off_m_s = _clearest(wanted, planes.values(), max_speed_m_s, limits)
+        alternatives = [planes | {one: plane(one, -side)} for one, (_, _, side) in planes.items() if off_m_s > 0.0]
+        for tried in alternatives:
+            other, other_off_m_s = _clearest(wanted, tried.values(), max_speed_m_s, limits)
+            if other_off_m_s < off_m_s:
+                clear, off_m_s, planes = other, other_off_m_s, tried
         self._sides = {tracks[one]: side for one, (_, _, side) in planes.items()}
-        return _clearest(wanted, planes.values(), max_speed_m_s, limits)
+        return clear
 
 
 def _clearest(
-    wanted: FloatArray, planes: Iterable[tuple[FloatArray, float, float]], max_speed_m_s: float, limits: Limits
-) -> FloatArray:
-    """The velocity (2,) m/s with the least sum of its distance from `wanted` and the largest violation / `_SHARE`.
+    wanted: FloatArray, planes: Iterable[_Plane], max_speed_m_s: float, limits: Limits
+) -> tuple[FloatArray, float]:
+    """The velocity (2,) m/s with the least sum of its distance from `wanted` and the largest violation / `_SHARE`, and
+    that violation, m/s.
 
     An exact penalty: it is the nearest velocity in all half-planes, unless those are nearly opposite and meet far away.
     There the least violation alone would be bought with the highest speed, to a side.
     """
     normals, least = np.reshape([one[0] for one in planes], (-1, 2)), np.array([one[1] for one in planes])
     if (normals @ wanted >= least - ROUNDING_M_S).all():
-        return wanted
+        return wanted, 0.0
     towards, most_m_s = (one[limits[1] < max_speed_m_s] for one in limits)  # the others do not bind
     across, at_m_s = np.vstack([normals, towards]), np.concatenate([least, most_m_s])
     feet = wanted + (at_m_s - across @ wanted)[:, None] * across
@@ -106,13 +117,13 @@ def _clearest(
     tried *= np.minimum(1.0, max_speed_m_s / np.maximum(np.linalg.norm(tried, axis=1), ROUNDING_M_S))[:, None]
     tried = tried[(tried @ towards.T <= most_m_s + ROUNDING_M_S).all(axis=1)]
     off = np.maximum(least - tried @ normals.T, 0.0).max(axis=1)
-    nearest: FloatArray = tried[np.argmin(np.linalg.norm(tried - wanted, axis=1) + off / _SHARE)]
-    return nearest
+    nearest = int(np.argmin(np.linalg.norm(tried - wanted, axis=1) + off / _SHARE))
+    return tried[nearest], max(float(off[nearest]) - ROUNDING_M_S, 0.0)
 
 
 def _half_plane(
     velocity: FloatArray, offset: FloatArray, relative: FloatArray, distance_m: float, side: float
-) -> tuple[FloatArray, float, float]:
+) -> _Plane:
     """One neighbour's half-plane: its normal (2,), the least component of the own velocity along it, m/s, and its side.
 
     The normal leads to the nearest point outside the cone of relative velocities that lead to a conflict, cut off at

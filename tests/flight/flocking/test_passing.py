@@ -97,12 +97,27 @@ def test_for_one_that_comes_by_itself_it_steps_aside_at_once() -> None:
     assert north_m_s > 1.9
 
 
-@pytest.mark.parametrize("most_m_s", [1.0, 0.1])
-def test_it_flies_no_faster_to_a_side_than_the_gate_lets_it(most_m_s: float) -> None:
-    """One comes head-on, and it turns to its right, as the rule has it."""
+@pytest.mark.parametrize(("most_m_s", "east"), [(1.0, 1.0), (0.1, -1.0)])
+def test_it_flies_no_faster_to_a_side_than_the_gate_lets_it(most_m_s: float, east: float) -> None:
+    """One comes head-on, and it turns to its right, as the rule has it; to its left if the right is blocked."""
     limits = np.array([[0.0, 1.0]]), np.array([most_m_s])
     velocity = passed([6.0, 0.0, 0.0], [-2.0, 0.0], limits=limits)
-    assert 0.0 < velocity[1] <= most_m_s
+    assert velocity[1] == pytest.approx(east * math.sqrt(1 - 1 / 16), abs=0.05)  # 4 m/s times the sine, 1.5 m / 6 m
+
+
+@pytest.mark.parametrize("speed_m_s", [1.0, 2.0])
+@pytest.mark.parametrize("offset_deg", [180.0, 150.0])
+def test_between_two_that_close_in_it_leaves_to_one_side(offset_deg: float, speed_m_s: float) -> None:
+    """Neither avoids. Its right of one is its left of the other: with the usual sides it stayed where both go."""
+    passing, angles = Passing(FlockingLaw(PARAMETERS), 3.0), np.radians([0.0, offset_deg])
+    velocities = -speed_m_s * np.column_stack([np.cos(angles), np.sin(angles)])
+    place, velocity, others, apart_m = np.zeros(2), np.zeros(2), -6.0 * velocities, []
+    for _ in range(24):
+        offsets = np.column_stack([others - place, np.zeros(2)])
+        velocity = passing.clear(np.zeros(2), velocity, offsets, velocities, [1, 2])
+        place, others = place + 0.5 * velocity, others + 0.5 * velocities
+        apart_m.append(np.hypot(*(others - place).T).min())
+    assert min(apart_m) > 1.3
 
 
 def test_it_does_not_dash_aside_for_a_conflict_that_it_cannot_resolve() -> None:
