@@ -88,28 +88,28 @@ class Passing:
             return _half_plane(velocity, offsets[one, :2], velocity - velocities[one], distance_m, side)
 
         planes = {one: plane(one, self._sides.get(tracks[one], 0.0)) for one in near}
-        clear, off_m_s = _clearest(wanted, planes.values(), max_speed_m_s, limits)
-        alternatives = [planes | {one: plane(one, -side)} for one, (_, _, side) in planes.items() if off_m_s > 0.0]
+        clear, least_m_s, resolved = _clearest(wanted, planes.values(), max_speed_m_s, limits)
+        alternatives = [planes | {one: plane(one, -side)} for one, (_, _, side) in planes.items() if not resolved]
         for tried in alternatives:
-            other, other_off_m_s = _clearest(wanted, tried.values(), max_speed_m_s, limits)
-            if other_off_m_s < off_m_s:
-                clear, off_m_s, planes = other, other_off_m_s, tried
+            other, cost_m_s, _ = _clearest(wanted, tried.values(), max_speed_m_s, limits)
+            if cost_m_s < least_m_s:
+                clear, least_m_s, planes = other, cost_m_s, tried
         self._sides = {tracks[one]: side for one, (_, _, side) in planes.items()}
         return clear
 
 
 def _clearest(
     wanted: FloatArray, planes: Iterable[_Plane], max_speed_m_s: float, limits: Limits
-) -> tuple[FloatArray, float]:
-    """The velocity (2,) m/s with the least sum of its distance from `wanted` and the largest violation / `_SHARE`, and
-    that violation, m/s.
+) -> tuple[FloatArray, float, bool]:
+    """The velocity (2,) m/s with the least sum of its distance from `wanted` and the largest violation / `_SHARE`; that
+    sum, m/s; and whether it is in all half-planes.
 
     An exact penalty: it is the nearest velocity in all half-planes, unless those are nearly opposite and meet far away.
     There the least violation alone would be bought with the highest speed, to a side.
     """
     normals, least = np.reshape([one[0] for one in planes], (-1, 2)), np.array([one[1] for one in planes])
     if (normals @ wanted >= least - ROUNDING_M_S).all():
-        return wanted, 0.0
+        return wanted, 0.0, True
     towards, most_m_s = (one[limits[1] < max_speed_m_s] for one in limits)  # the others do not bind
     across, at_m_s = np.vstack([normals, towards]), np.concatenate([least, most_m_s])
     feet = wanted + (at_m_s - across @ wanted)[:, None] * across
@@ -117,8 +117,9 @@ def _clearest(
     tried *= np.minimum(1.0, max_speed_m_s / np.maximum(np.linalg.norm(tried, axis=1), ROUNDING_M_S))[:, None]
     tried = tried[(tried @ towards.T <= most_m_s + ROUNDING_M_S).all(axis=1)]
     off = np.maximum(least - tried @ normals.T, 0.0).max(axis=1)
-    nearest = int(np.argmin(np.linalg.norm(tried - wanted, axis=1) + off / _SHARE))
-    return tried[nearest], max(float(off[nearest]) - ROUNDING_M_S, 0.0)
+    costs = np.linalg.norm(tried - wanted, axis=1) + off / _SHARE
+    nearest = int(np.argmin(costs))
+    return tried[nearest], float(costs[nearest]), bool(off[nearest] <= ROUNDING_M_S)
 
 
 def _half_plane(

@@ -346,7 +346,8 @@ class FlockPilot:
         desired = self._mission.desired
         own = guidance.velocity if velocity is None else velocity[:2]  # before the first pair: the mission's
         if self._ranging is None:
-            tracks, limits = [n.track for n in seen], limits_towards(neighbours, self._config.safety.gate)
+            tracks = [n.track for n in seen]
+            limits = limits_towards(neighbours, vehicle.position, self._config.safety.gate)
             command, acceleration = self._passing.command(
                 own, places, velocities, desired, self._config.step_s, tracks, limits, ages_s
             )

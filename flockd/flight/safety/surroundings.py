@@ -12,7 +12,7 @@ from flockd.core.config.safety import GateParameters
 from flockd.core.messages import SECTORS, FloatArray, Neighbour, PossibleMotion
 from flockd.flight.safety.approach import stopping_speed, towards_neighbours, towards_obstacles
 from flockd.flight.safety.fence import towards_fence
-from flockd.flight.safety.half_planes import Limits
+from flockd.flight.safety.half_planes import NO_LIMITS, Limits
 from flockd.flight.safety.request import Objection, Surroundings
 
 _NORMAL = NormalDist()
@@ -56,13 +56,16 @@ def surroundings(
     )
 
 
-def limits_towards(neighbours: Sequence[Neighbour], p: GateParameters) -> Limits:
-    """Directions (k, 2) to neighbours, and the greatest speed, (k,) m/s, that the gate permits there as the step ends.
+def limits_towards(neighbours: Sequence[Neighbour], position: FloatArray | None, p: GateParameters) -> Limits:
+    """Directions (k, 2) to neighbours and the fence, and the greatest speed, (k,) m/s, that the gate permits there as
+    the step ends.
 
-    For a pilot, so that it does not command what the gate refuses.
+    For a pilot, so that it does not command what the gate refuses. `position` (2,) m from home; None: not known.
     """
     places, velocities, margins, unseen_s = _motions(neighbours, 0.0, np.zeros(3))
-    return towards_neighbours(p, places, velocities, p.min_separation_m, margins, unseen_s)
+    near = towards_neighbours(p, places, velocities, p.min_separation_m, margins, unseen_s)
+    fence = NO_LIMITS if position is None else towards_fence(p, position)
+    return np.concatenate([near[0], fence[0]]), np.concatenate([near[1], fence[1]])
 
 
 def limits_around(

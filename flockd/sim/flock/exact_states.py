@@ -95,7 +95,7 @@ class ExactFlock:
             if around is not None and self._avoids:
                 flown_as = self._avoidances[i].command(self._law, moving, places, others, desired, around, ages_s)
             elif self._passes:
-                tracks, limits = [one.track for one in seen], limits_towards(known[i], self._gate)
+                tracks, limits = [one.track for one in seen], limits_towards(known[i], here, self._gate)
                 flown_as = self._passings[i].command(
                     moving, places, others, desired, self._step_s, tracks, limits, ages_s
                 )

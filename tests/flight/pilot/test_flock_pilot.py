@@ -25,8 +25,9 @@ from flockd.core.messages import (
 from flockd.flight.geometry import RigCamera, rotation_angle_deg, rotation_from_euler
 from flockd.flight.perception import Observation, SceneMaps
 from flockd.flight.pilot import FlockPilot
+from flockd.flight.tracking import Tracker
 from tests.flight.pilot.flyer import STEP_S, Flyer, SpoilableTruth, scenario_with
-from tests.make import changed, detection, frames, vehicle
+from tests.make import changed, detection, frames, neighbour, vehicle
 
 NEVER_ASKED = SpoilableTruth()
 """Networks of a pilot that gets no images."""
@@ -115,6 +116,17 @@ def test_the_gate_is_told_how_far_was_seen_and_the_heading_turns_to_where_a_came
     refused = flyer.pilot.step(frames, replace(state, height_m=math.nan))
     assert refused.command.yaw_rad == output.command.yaw_rad
     assert refused.seen_m is not None and refused.seen_m[0] == pytest.approx(ahead_m[-1])
+
+
+@pytest.mark.fault("one-that-does-not-avoid")
+@pytest.mark.parametrize(("east_m", "side"), [(0.0, 1.0), (99.5, -1.0)])
+def test_beside_the_fence_it_makes_way_to_the_other_side(
+    east_m: float, side: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One comes head-on; on the right, where it would turn to, is the fence 100 m from home."""
+    monkeypatch.setattr(Tracker, "neighbours", lambda _: (neighbour([6.0, 0.0, 0.0], [-1.0, 0.0, 0.0]),))
+    output = FlockPilot(ALONE.drone, NEVER_ASKED).step(frames(0.0), vehicle(position=[0.0, east_m]))
+    assert side * output.command.velocity[1] > 0.3
 
 
 def test_a_neighbour_pulls_by_how_long_it_has_been_seen() -> None:

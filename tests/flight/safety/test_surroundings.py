@@ -92,18 +92,18 @@ def test_a_neighbour_that_would_have_flown_through_the_drone_has_braked(
 def test_one_that_goes_may_have_braked_since_it_was_seen_last(unseen_s: float, left_m: float) -> None:
     """2 m/s ahead at 4 m by its track: it stands 2^2 / 2 / 5 = 0.4 m farther on than where it was seen; 1 m is kept."""
     one = known([4.0, 0.0, 0.0], [2.0, 0.0, 0.0], 0.0, unseen_s=unseen_s)
-    flies_on_m_s, brakes_m_s = limits_towards([one], GateParameters())[1]
+    flies_on_m_s, brakes_m_s = limits_towards([one], None, GateParameters())[1]
     assert flies_on_m_s == pytest.approx(math.sqrt(1.5**2 + 2 * 1.5 * 3.0 + 2.0**2) - 1.5)
     assert brakes_m_s == pytest.approx(math.sqrt(0.75**2 + 2 * 1.5 * left_m) - 0.75)
     # Two standard deviations of its place, and of its velocity for the reaction time of a second.
     for unsure in (replace(one, position_sigma_m=0.25), replace(one, velocity_sigma_m_s=0.25)):
-        slower_m_s = limits_towards([unsure], GateParameters())[1][1]
+        slower_m_s = limits_towards([unsure], None, GateParameters())[1][1]
         assert slower_m_s == pytest.approx(math.sqrt(0.75**2 + 3 * max(left_m - 2 * 0.25, 0.0)) - 0.75)
     np.testing.assert_allclose(told(one).neighbour_unseen_s, [unseen_s + 0.5])
 
 
 def test_of_nobody_and_nothing_there_are_arrays_all_the_same() -> None:
-    near, (directions, most_m_s) = told(), limits_towards([], GateParameters())
+    near, (directions, most_m_s) = told(), limits_towards([], None, GateParameters())
     assert near.neighbours.shape == (0, 3)
     assert near.neighbour_velocities.shape == near.neighbour_margins.shape == near.obstacles.shape == (0, 2)
     assert directions.shape == (0, 2) and most_m_s.shape == (0,)
@@ -112,13 +112,15 @@ def test_of_nobody_and_nothing_there_are_arrays_all_the_same() -> None:
 def test_a_pilot_hears_how_fast_the_gate_lets_it_fly_towards_each() -> None:
     """4 m ahead, 3 m left: sqrt(0.75^2 + 1.5 * 3) - 0.75 = 1.5 m/s, as if it began to come now; below, no limit."""
     p, here = GateParameters(), [4.0, 0.0, 0.0]
-    directions, most_m_s = limits_towards([known(here, sigma=0.0), known([0.0, 6.0, 3.5], sigma=0.0)], p)
+    directions, most_m_s = limits_towards([known(here, sigma=0.0), known([0.0, 6.0, 3.5], sigma=0.0)], None, p)
     np.testing.assert_allclose(directions, [[1.0, 0.0], [1.0, 0.0]])  # as flying on, and as braking
     assert most_m_s.min() == pytest.approx(1.5)
-    goes = limits_towards([known(here, [1.0, 0.0, 0.0], 0.0)], p)[1]
+    goes = limits_towards([known(here, [1.0, 0.0, 0.0], 0.0)], None, p)[1]
     # sqrt(1.5^2 + 2 * 1.5 * 3 + 1^2) - 1.5: it may brake unseen for a second. Or it does now, and stands 0.1 m on.
     np.testing.assert_allclose(goes, [2.0, math.sqrt(0.75**2 + 2 * 1.5 * 3.1) - 0.75])
-    assert limits_towards([known(here, sigma=0.5)], p)[1].min() < 1.0, "in doubt"
+    assert limits_towards([known(here, sigma=0.5)], None, p)[1].min() < 1.0, "in doubt"
+    directions, most_m_s = limits_towards([], np.array([99.0, 0.0]), p)  # 1 m before the fence, of which 0.6 m are kept
+    assert most_m_s[directions[:, 0] > 0.99].tolist() == [pytest.approx(math.sqrt(0.75**2 + 3 * 0.4) - 0.75)]
 
 
 @pytest.mark.parametrize("velocity", [(0.0, 0.0), (math.nan, math.nan), (math.nan, 1.0)])
