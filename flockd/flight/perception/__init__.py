@@ -8,7 +8,7 @@ from flockd.flight.perception.interface import (
     ImageView,
     Networks,
     OneByOne,
-    RangeEstimate,
+    RangeEstimates,
     SceneMaps,
     outcome,
 )
@@ -26,7 +26,7 @@ __all__ = [
     "OneByOne",
     "OnnxNetworks",
     "Perception",
-    "RangeEstimate",
+    "RangeEstimates",
     "SceneMaps",
     "group_instances",
     "load_networks",

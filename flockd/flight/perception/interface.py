@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol, TypeVar
 
 import cv2
+import numpy as np
 
 from flockd.core.errors import ModelError
 from flockd.core.messages import Float32Array, FloatArray, Frame, UInt8Array
@@ -56,22 +57,27 @@ class KnownSize:
     sigma_m: float
 
 
-@dataclass(frozen=True, eq=False)
-class RangeEstimate:
-    """The second stage's estimate from one crop."""
+class RangeEstimates(NamedTuple):
+    """The second stage's estimates from n crops; NaN: there is none."""
 
-    log_range: float
-    """Natural logarithm of the range in metres, from the virtual camera's optical centre."""
-    log_range_sigma: float
-    """Standard deviation of `log_range`, given the size."""
+    log_range: FloatArray
+    """(n,) natural logarithm of the range in metres, from the virtual camera's optical centre."""
+    log_range_sigma: FloatArray
+    """(n,) standard deviation of `log_range`, given the size."""
     centre: FloatArray
-    """(2,) u, v of the drone's centre in the crop."""
-    size_m: float
-    """The drone's size from tip to tip; its error is that of the range, but the same in every crop of one drone."""
-    drone_probability: float = 1.0
-    """Probability that there is a drone at all."""
-    log_size_sigma: float = 0.0
-    """Standard deviation of the logarithm of `size_m`. `log_range` has the same error besides its own."""
+    """(n, 2) u, v of the drone's centre in the crop."""
+    size_m: FloatArray
+    """(n,) the drone's size from tip to tip; its error is that of the range, but the same in every crop of a drone."""
+    drone_probability: FloatArray
+    """(n,) probability that there is a drone at all."""
+    log_size_sigma: FloatArray
+    """(n,) standard deviation of the logarithm of `size_m`. `log_range` has the same error besides its own."""
+
+    @classmethod
+    def unknown(cls, count: int) -> RangeEstimates:
+        """Of so many crops, without any estimate."""
+        log_range, sigma, *rest = np.full((5, count), np.nan)
+        return cls(log_range, sigma, np.full((count, 2), np.nan), *rest)
 
 
 @dataclass(frozen=True)
@@ -148,10 +154,10 @@ class Networks(Protocol):
         """Depth and drones of each image, or one of `CAMERA_FAULTS`."""
         ...
 
-    def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
+    def ranges(self, crops: Sequence[Crop]) -> RangeEstimates:
         """Range and centre of the drone in the middle of each crop.
 
-        The range may be NaN if the probability is at most `another_crop_probability`.
+        All but the probability may be NaN if that is at most `another_crop_probability`.
         """
         ...
 

@@ -22,7 +22,7 @@ from flockd.flight.inference.session import Deadline, OnnxModel, no_deadline
 from flockd.flight.perception.detection.boxes import BoxRules, kept_boxes, probable_boxes, with_boxes
 from flockd.flight.perception.detection.instances import group_instances
 from flockd.flight.perception.flow import DisFlow, OnnxFlow, grid_flow
-from flockd.flight.perception.interface import Crop, OneByOne, RangeEstimate, SceneMaps, SecondStage
+from flockd.flight.perception.interface import Crop, OneByOne, RangeEstimates, SceneMaps, SecondStage
 
 CROPS_PER_RUN = 24
 """Crops in one run of a network, so that an image full of false proposals takes no more memory."""
@@ -103,10 +103,10 @@ class OnnxNetworks(OneByOne):
             labels, instances = with_boxes(labels, instances, boxes, odds, self._box_rules)
         return SceneMaps(self._depth_of(depth, camera), labels, instances)
 
-    def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
+    def ranges(self, crops: Sequence[Crop]) -> RangeEstimates:
         """See `Networks`."""
         if not crops:
-            return ()
+            return RangeEstimates.unknown(0)
         images = [np.ascontiguousarray(c.image[:, ::-1]) if c.mirrored else c.image for c in crops]
         logits, limit = np.array([crop.evidence for crop in crops]), math.inf
         if self._verification is not None:
@@ -116,22 +116,22 @@ class OnnxNetworks(OneByOne):
             limit = judge.manifest.thresholds["distance_logit_limit"]
         # Without a drone no range is needed: most crops of a cluttered image end here.
         most = _probability(logits + limit)
-        rest = [k for k, p in enumerate(most) if p > self.second_stage.another_crop_probability]
-        ranged = self._ranges([crops[k] for k in rest], [images[k] for k in rest], logits[rest], limit)
-        estimates = [_no_range(float(p), self.second_stage.crop_size) for p in most]
-        for k, estimate in zip(rest, ranged, strict=True):
-            estimates[k] = estimate
-        return tuple(estimates)
+        rest = np.flatnonzero(most > self.second_stage.another_crop_probability).tolist()
+        middles = np.full((len(crops), 2), self.second_stage.crop_size / 2)
+        estimates = RangeEstimates.unknown(len(crops))._replace(centre=middles, drone_probability=most)
+        if rest:
+            ranged = self._ranges([crops[k] for k in rest], [images[k] for k in rest], logits[rest], limit)
+            for column, values in zip(estimates, ranged, strict=True):
+                column[rest] = values
+        return estimates
 
     def _ranges(
         self, crops: Sequence[Crop], images: Sequence[UInt8Array], logits: FloatArray, limit: float
-    ) -> tuple[RangeEstimate, ...]:
+    ) -> RangeEstimates:
         """The distance network's estimates from crops, given their images as its input.
 
         Its own log odds of a drone are added to ``logits`` (n,), up to ``limit``: log odds of independent evidence add.
         """
-        if not crops:
-            return ()
         outputs = _in_batches(self._distance, images)["range"]
         columns = self._distance.manifest.results["range"].by_column(outputs)
         values = {name: np.asarray(column, np.float64) for name, column in columns.items()}
@@ -139,16 +139,14 @@ class OnnxNetworks(OneByOne):
         mirrored, focal_px = np.array([(crop.mirrored, crop.focal_px) for crop in crops]).T
         right = np.where(mirrored, -values["right_px"], values["right_px"])  # mirrored back
         size_sigma = np.exp(values.get("log_size_sigma", np.full(len(crops), -np.inf)))
-        rows = zip(
-            (values["log_range_per_focal"] + np.log(focal_px)).tolist(),
-            np.exp(values["log_relative_sigma"]).tolist(),
-            np.stack([right, values["down_px"]], 1) + len(crops[0].image) / 2,
-            np.exp(values["log_range_per_focal"] + values["log_apparent_size"]).tolist(),
-            _probability(evidence).tolist(),
-            np.minimum(size_sigma, _MOST_SIZE_SIGMA).tolist(),
-            strict=True,
+        return RangeEstimates(
+            log_range=values["log_range_per_focal"] + np.log(focal_px),
+            log_range_sigma=np.exp(values["log_relative_sigma"]),
+            centre=np.stack([right, values["down_px"]], 1) + len(crops[0].image) / 2,
+            size_m=np.exp(values["log_range_per_focal"] + values["log_apparent_size"]),
+            drone_probability=_probability(evidence),
+            log_size_sigma=np.minimum(size_sigma, _MOST_SIZE_SIGMA),
         )
-        return tuple(RangeEstimate(*row) for row in rows)
 
     def _boxes(
         self, detector: OnnxModel, rules: BoxRules, image: UInt8Array, camera: RigCamera
@@ -266,12 +264,6 @@ def _in_batches(model: OnnxModel, images: Sequence[UInt8Array]) -> dict[str, Flo
     batches = [images[i : i + CROPS_PER_RUN] for i in range(0, len(images), CROPS_PER_RUN)]
     outputs = [model.infer({"crop": batch}) for batch in batches]
     return {name: np.concatenate([output[name] for output in outputs]) for name in outputs[0]}
-
-
-def _no_range(drone_probability: float, size: int) -> RangeEstimate:
-    """The estimate for a crop that shows no drone."""
-    middle = np.array([size / 2, size / 2])
-    return RangeEstimate(math.nan, math.nan, middle, math.nan, drone_probability=drone_probability)
 
 
 def _probability(logit: FloatArray) -> FloatArray:

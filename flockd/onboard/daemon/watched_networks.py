@@ -16,7 +16,7 @@ from flockd.flight.perception import (
     ImagePair,
     ImageView,
     OneByOne,
-    RangeEstimate,
+    RangeEstimates,
     SceneMaps,
     load_networks,
     outcome,
@@ -81,7 +81,7 @@ class WatchedNetworks:
         """Depth and drones of each image."""
         return self._counted(self._each("scene", self._networks.scene, views))
 
-    def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
+    def ranges(self, crops: Sequence[Crop]) -> RangeEstimates:
         """Range and centre of the drone in the middle of each crop; all in one batch."""
         (result,) = self._counted(self._each("ranges", self._networks.ranges, [(crops,)]))
         if isinstance(result, Exception):

@@ -14,12 +14,12 @@ from flockd.core.choices import ROLES
 from flockd.core.config.perception import PerceptionConfig
 from flockd.core.data import data_path
 from flockd.core.errors import ModelError
-from flockd.core.messages import Frame, UInt8Array
+from flockd.core.messages import FloatArray, Frame, UInt8Array
 from flockd.flight.inference import OnnxModel, find_manifests, load_manifest
 from flockd.flight.inference.manifest_file import read_manifest
 from flockd.flight.perception import Crop, DisFlow, OnnxNetworks
 from flockd.flight.perception.flow import OnnxFlow, grid_flow
-from flockd.flight.perception.interface import RangeEstimate
+from flockd.flight.perception.interface import RangeEstimates
 from tests.flight.perception.cameras import crop_of, rendered
 from tests.make import rig_camera
 from tools.measure.labelled import half_overlap
@@ -105,10 +105,10 @@ def test_the_twins_in_8_bits_say_what_the_float_networks_say() -> None:
     assert both / any_ > 0.8
     windows = [image[v - 48 : v + 48, u - 48 : u + 48] for u, v in ((86, 130), (234, 190))]
     pictures = [crop_of(window, 222.0) for window in windows]
-    for mine, other in zip(ours.ranges(pictures), theirs.ranges(pictures), strict=True):
-        assert other.drone_probability > 0.5
-        assert mine.log_range == pytest.approx(other.log_range, abs=0.05)
-        np.testing.assert_allclose(mine.centre, other.centre, atol=1.5)
+    mine, others = ours.ranges(pictures), theirs.ranges(pictures)
+    assert (others.drone_probability > 0.5).all()
+    assert mine.log_range == pytest.approx(others.log_range, abs=0.05)
+    np.testing.assert_allclose(mine.centre, others.centre, atol=1.5)
 
 
 def test_the_network_of_flow_is_made_exact_as_configured() -> None:
@@ -139,24 +139,22 @@ def crops() -> list[Crop]:
     return taken
 
 
-def ranges(models: Path = MODELS, **names: str) -> tuple[RangeEstimate, ...]:
+def ranges(models: Path = MODELS, **names: str) -> RangeEstimates:
     return OnnxNetworks(PerceptionConfig.model_validate({"flow": "dis", **names}), models).ranges(crops())
 
 
-def logit(estimate: RangeEstimate) -> float:
-    p = estimate.drone_probability
-    return math.log(p / (1.0 - p))
+def logits(estimates: RangeEstimates) -> FloatArray:
+    p = estimates.drone_probability
+    return np.asarray(np.log(p / (1.0 - p)))
 
 
 def test_a_drone_keeps_the_range_that_the_distance_network_gives_and_what_is_none_gets_no_range() -> None:
     with_it, without = ranges(), ranges(verification="none")
-    for ours, theirs in zip(with_it[:2], without[:2], strict=True):
-        assert ours.drone_probability > 0.9
-        assert (ours.log_range, ours.log_range_sigma, ours.size_m) == pytest.approx(
-            (theirs.log_range, theirs.log_range_sigma, theirs.size_m), rel=1e-5
-        )
-    assert with_it[2].drone_probability <= 0.2, "the least for another crop"
-    assert math.isnan(with_it[2].log_range)
+    assert (with_it.drone_probability[:2] > 0.9).all()
+    for name in ("log_range", "log_range_sigma", "size_m"):
+        assert getattr(with_it, name)[:2] == pytest.approx(getattr(without, name)[:2], rel=1e-5)
+    assert with_it.drone_probability[2] <= 0.2, "the least for another crop"
+    assert math.isnan(with_it.log_range[2])
 
 
 @pytest.mark.parametrize(("detector", "says"), [("none", "verification"), ("detector", "detector")])
@@ -167,13 +165,13 @@ def test_the_distance_networks_logit_is_added_up_to_the_limit(copies: Path, dete
     judge.write_text(judge.read_text("utf-8").replace("another_crop_probability: 0.2", "another_crop_probability: 0.0"))
     shipped = manifest.read_text(encoding="utf-8")
 
-    def limited(limit: float) -> list[float]:
+    def limited(limit: float) -> FloatArray:
         document = yaml.safe_load(shipped)
         document["thresholds"]["distance_logit_limit"] = limit
         manifest.write_text(yaml.safe_dump(document), encoding="utf-8")
-        return [logit(one) for one in ranges(copies, **names)]
+        return logits(ranges(copies, **names))
 
-    alone = [logit(one) for one in ranges(verification="none", distance="distance")]
+    alone = logits(ranges(verification="none", distance="distance"))
     for limit in (0.5, 1.0):
         added = np.subtract(limited(limit), limited(0.0))
         assert added == pytest.approx(np.clip(alone, -limit, limit), abs=1e-3)

@@ -10,7 +10,7 @@ import numpy as np
 
 from flockd.core.messages import Float32Array, FloatArray, Frame, UInt8Array
 from flockd.flight.geometry import RigCamera, ZMap
-from flockd.flight.perception import Crop, OneByOne, RangeEstimate, SceneMaps
+from flockd.flight.perception import Crop, OneByOne, RangeEstimates, SceneMaps
 from flockd.flight.perception.detection.instances import Instance
 from flockd.sim.cameras.camera_simulator import CameraSimulator
 from flockd.sim.renderer.renderer import Renderer, View, true_flow
@@ -74,9 +74,13 @@ class TrueNetworks(OneByOne):
         depth = ZMap(np.where(np.isfinite(view.depth), view.depth, np.float32(_SKY_M)))
         return SceneMaps(depth=depth, labels=view.ids, instances=tuple(self._instances(camera)))
 
-    def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
+    def ranges(self, crops: Sequence[Crop]) -> RangeEstimates:
         """The true range of the drone nearest to each crop's middle."""
-        return tuple(self._range(crop) for crop in crops)
+        found = RangeEstimates.unknown(len(crops))
+        for k, crop in enumerate(crops):
+            found.log_range[k], found.centre[k], found.drone_probability[k] = self._range(crop)
+        size, certain = np.full(len(crops), _SIZE_M), np.zeros(len(crops))
+        return found._replace(log_range_sigma=np.full(len(crops), 0.001), size_m=size, log_size_sigma=certain)
 
     def _instances(self, camera: RigCamera) -> list[Instance]:
         drawn, found = self._now[camera.name], []
@@ -92,12 +96,13 @@ class TrueNetworks(OneByOne):
             found.append(Instance(drone + 1, centre, box, float(rows.size)))
         return sorted(found, key=lambda one: -one.area_px)
 
-    def _range(self, crop: Crop) -> RangeEstimate:
+    def _range(self, crop: Crop) -> tuple[float, FloatArray, float]:
+        """Log range, centre and probability."""
         size, drawn = len(crop.image), next(iter(self._now.values()))
         views = [one.view for one in self._now.values()]
         visible = [d for d in drawn.shown if any((view.ids == d + 1).sum() >= _MIN_PIXELS for view in views)]
         if not visible:
-            return RangeEstimate(0.0, 1.0, np.full(2, size / 2), _SIZE_M, drone_probability=0.0)
+            return 0.0, np.full(2, size / 2), 0.0
         (own,) = set(range(len(drawn.drone_positions))) - set(drawn.shown)
         in_body = (drawn.drone_positions[visible] - drawn.drone_positions[own]) @ drawn.drone_rotations[own]
         in_view = (in_body - crop.centre) @ crop.R_body_camera
@@ -106,4 +111,4 @@ class TrueNetworks(OneByOne):
         log_range = float(np.log(np.linalg.norm(point)))
         centre = size / 2 + crop.focal_px * point[:2] / max(point[2], 1e-3)
         inside = bool(((centre > 0) & (centre < size)).all())
-        return RangeEstimate(log_range, 0.001, np.clip(centre, -size, 2 * size), _SIZE_M, float(inside))
+        return log_range, np.clip(centre, -size, 2 * size), float(inside)

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from flockd.core.messages import Float32Array, FloatArray, Frame, UInt8Array
 from flockd.flight.geometry import RigCamera, ZMap
-from flockd.flight.perception import Crop, DisFlow, OneByOne, RangeEstimate, SceneMaps
+from flockd.flight.perception import Crop, DisFlow, OneByOne, RangeEstimates, SceneMaps
 from flockd.sim.renderer.renderer import Renderer
 from flockd.sim.world.world import World
 from tests.flight.perception.cameras import SECOND_STAGE
@@ -74,8 +74,8 @@ class Onlooker(OneByOne):
         depth = np.minimum(next(self._depth), 1000.0).astype(np.float32)
         return SceneMaps(ZMap(depth), np.zeros(frame.image.shape[:2], np.uint8), ())
 
-    def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
-        return ()
+    def ranges(self, crops: Sequence[Crop]) -> RangeEstimates:
+        return RangeEstimates.unknown(0)
 
 
 def write_rgbd_folder(scene: Scene, path: Path) -> Path:

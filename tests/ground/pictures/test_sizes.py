@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,7 @@ from flockd.core.config.perception import PerceptionConfig
 from flockd.core.data import data_path
 from flockd.flight.inference import OnnxModel
 from flockd.flight.perception import load_networks
-from flockd.flight.perception.interface import Crop, RangeEstimate
+from flockd.flight.perception.interface import Crop, RangeEstimates
 from flockd.flight.perception.onnx import OnnxNetworks
 from flockd.ground.datasets.image_files import read_image
 from flockd.ground.pictures.single_frame import KNOWN_LOG_SIZE_SIGMA, UNKNOWN_LOG_SIZE_SIGMA, PictureDetector
@@ -33,8 +32,8 @@ class Doubtful:
     def __getattr__(self, name: str) -> object:
         return getattr(self._networks, name)
 
-    def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
-        return tuple(replace(one, log_size_sigma=self._sigma) for one in self._networks.ranges(crops))
+    def ranges(self, crops: Sequence[Crop]) -> RangeEstimates:
+        return self._networks.ranges(crops)._replace(log_size_sigma=np.full(len(crops), self._sigma))
 
 
 @pytest.mark.parametrize(("doubt", "said_m", "known"), [(0.02, None, True), (0.2, None, False), (0.2, 0.35, True)])

@@ -29,7 +29,7 @@ from flockd.core.config.source import SharedMemoryParameters, SourceParameters
 from flockd.core.messages import Float32Array, Frame, UInt8Array
 from flockd.fleet.watcher import FleetWatcher, Heard
 from flockd.flight.geometry import RigCamera, ZMap
-from flockd.flight.perception import Crop, OneByOne, RangeEstimate, SceneMaps
+from flockd.flight.perception import Crop, OneByOne, RangeEstimates, SceneMaps
 from flockd.onboard.autopilot.refusal_reasons import REASONS
 from flockd.onboard.daemon import Daemon, ServiceManager
 from flockd.onboard.sources import FramePublisher
@@ -104,8 +104,8 @@ class TinyPerceiver(OneByOne):
         depth = (5.0 + 0.02 * rows + 0.01 * columns).astype(np.float32)
         return SceneMaps(ZMap(depth), np.zeros((height, width), np.uint8), ())
 
-    def ranges(self, crops: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
-        return ()
+    def ranges(self, crops: Sequence[Crop]) -> RangeEstimates:
+        return RangeEstimates.unknown(0)
 
 
 Image = Callable[[str, int], UInt8Array]

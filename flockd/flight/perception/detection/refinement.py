@@ -14,7 +14,7 @@ from flockd.core.config.perception import DetectionParameters
 from flockd.core.messages import BoolArray, FloatArray, IntArray, Reason, ReasonKind, UInt8Array
 from flockd.flight.geometry import Rig, log_polar_covariance, virtual_crops
 from flockd.flight.perception.detection.proposals import Proposal, angles_between, pixel_angles
-from flockd.flight.perception.interface import Crop, KnownSize, Networks, RangeEstimate
+from flockd.flight.perception.interface import Crop, KnownSize, Networks, RangeEstimates
 
 LIKELY = 0.5
 """A proposal that is likelier a drone than not is a candidate: the tracker weighs the probability."""
@@ -35,7 +35,7 @@ class Candidate:
     size_m: float
     drone_probability: float = 1.0
     log_size_sigma: float = 0.0
-    """As of `RangeEstimate`."""
+    """As of `RangeEstimates`."""
 
     @property
     def range_m(self) -> float:
@@ -192,16 +192,8 @@ class Cascade:
             Crop(image, focal, R, centre, mirrored, one.evidence)
             for image, focal, R, centre, one in zip(*fields, strict=True)
         ]
-        of_crops = self._ranges(crops)
-        given = np.array([k for k, one in enumerate(of_crops) if one is not None], np.int64)
-        at, views = at[given], views.take(given)
-        rows = [
-            (*one.centre, one.log_range, one.log_range_sigma, one.size_m, one.drone_probability, one.log_size_sigma)
-            for one in of_crops
-            if one is not None
-        ]
-        numbers = np.array(rows, np.float64).reshape(-1, 7)
-        estimates = Estimates(views.rays(numbers[:, :2]), *numbers[:, 2:].T)
+        log_range, sigma, centre, *rest = self._ranges(crops)
+        estimates = Estimates(views.rays(centre), log_range, sigma, *rest)
         if self._known_size is not None:
             estimates = estimates.of_size(self._known_size)
         # The camera is not at the body's origin, so bearing and range change a little.
@@ -210,24 +202,25 @@ class Cascade:
         places = np.where(near[:, None], views.centres, 0.0) + ranges * estimates.bearing
         range_m = np.linalg.norm(places, axis=1)
         placed = range_m > 0.0
-        for place in places[~placed]:
+        for place in places[range_m <= 0.0]:  # not of those without an estimate
             self._drop(f"a place at {place.tolist()} m has no bearing")
         range_m = np.where(placed, range_m, 1.0)
         log_range = np.where(near, np.log(range_m), estimates.log_range)
         return at[placed], estimates._replace(bearing=places / range_m[:, None], log_range=log_range).take(placed)
 
-    def _ranges(self, crops: Sequence[Crop]) -> list[RangeEstimate | None]:
-        """One estimate for each crop. If the network fails on several, each half is tried alone: one crop is lost."""
+    def _ranges(self, crops: Sequence[Crop]) -> RangeEstimates:
+        """An estimate for each crop. If the network fails on several, each half is tried alone: one crop is lost."""
         if not crops:
-            return []
+            return RangeEstimates.unknown(0)
         try:
-            return list(self._network.ranges(crops))
+            return self._network.ranges(crops)
         except (FloatingPointError, ValueError) as error:
             if len(crops) == 1:
                 self._drop(str(error))
-                return [None]
+                return RangeEstimates.unknown(1)
             half = len(crops) // 2
-            return [*self._ranges(crops[:half]), *self._ranges(crops[half:])]
+            halves = self._ranges(crops[:half]), self._ranges(crops[half:])
+            return RangeEstimates(*(np.concatenate(columns) for columns in zip(*halves, strict=True)))
 
     def _with_mirrored(
         self, proposals: NDArray[Any], at: IntArray, aims: _Aims, shown: Estimates

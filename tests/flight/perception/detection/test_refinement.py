@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from flockd.core.config.perception import DetectionParameters, PerceptionConfig
 from flockd.core.messages import FloatArray
 from flockd.flight.geometry import log_polar
-from flockd.flight.perception import Crop, Perception, RangeEstimate
+from flockd.flight.perception import Crop, Perception, RangeEstimates
 from flockd.flight.perception.detection.instances import Instance
 from flockd.flight.perception.detection.nms import fuse, suppress
 from flockd.flight.perception.detection.proposals import Proposal, Roi
@@ -28,14 +28,15 @@ def flyer() -> Flyer:
     return Flyer(scenario_with((0.0, 0.0, -4.5), (3.0, 0.0, -4.5)))
 
 
-def answering(flyer: Flyer, change: Callable[[int, Crop, RangeEstimate], RangeEstimate]) -> list[Crop]:
-    """Has each estimate of the second stage changed, by how often it was asked before; the crops that it gets."""
+def answering(flyer: Flyer, change: Callable[[int, Crop, RangeEstimates], RangeEstimates]) -> list[Crop]:
+    """Has the second stage's estimates, of one crop at a time, changed by how often it was asked before; its crops."""
     estimates, crops = flyer.truth.sound("ranges"), list[Crop]()
 
-    def ranges(asked: Sequence[Crop]) -> tuple[RangeEstimate, ...]:
-        given = [change(len(crops), crop, one) for crop, one in zip(asked, estimates(asked), strict=True)]
-        crops.extend(asked)
-        return tuple(given)
+    def ranges(asked: Sequence[Crop]) -> RangeEstimates:
+        (crop,) = asked
+        given = change(len(crops), crop, estimates(asked))
+        crops.append(crop)
+        return given
 
     flyer.truth.instead["ranges"] = ranges
     return crops
@@ -58,7 +59,7 @@ def test_a_proposal_is_cropped_again_until_the_crop_suits_the_drone(
     """What a badly cut crop says of the range cuts the next one; the last estimate counts."""
     factors = [math.log(factor) for factor in wrong_by]
     crops = answering(
-        flyer, lambda asked, _, one: replace(one, log_range=factors[min(asked, len(factors) - 1)] + one.log_range)
+        flyer, lambda asked, _, one: one._replace(log_range=factors[min(asked, len(factors) - 1)] + one.log_range)
     )
     (detection,) = flyer.step().detections
     assert len(crops) == wanted + 1
@@ -68,10 +69,12 @@ def test_a_proposal_is_cropped_again_until_the_crop_suits_the_drone(
 def test_the_mirrored_crop_is_weighted_by_its_variance(flyer: Flyer) -> None:
     """A drone is 3 m away: the last crop says 3 m, its mirror image 6."""
 
-    def judged(asked: int, crop: Crop, one: RangeEstimate) -> RangeEstimate:
+    def judged(asked: int, crop: Crop, one: RangeEstimates) -> RangeEstimates:
         if crop.mirrored:
-            return replace(one, log_range=math.log(6.0), log_range_sigma=0.1, drone_probability=0.85)
-        return replace(one, log_range_sigma=0.05, drone_probability=0.9)
+            says = {"log_range": math.log(6.0), "log_range_sigma": 0.1, "drone_probability": 0.85}
+        else:
+            says = {"log_range_sigma": 0.05, "drone_probability": 0.9}
+        return one._replace(**{name: np.array([value]) for name, value in says.items()})
 
     crops = answering(flyer, judged)
     (detection,) = flyer.step().detections
@@ -94,7 +97,7 @@ def test_a_low_probability_of_the_first_crop_does_not_outlive_the_next(
     flyer: Flyer, given: tuple[float, ...], found: int
 ) -> None:
     """Only a very low one rejects at once; the first crop was not cut to this drone."""
-    answering(flyer, lambda asked, _, one: replace(one, drone_probability=given[asked]))
+    answering(flyer, lambda asked, _, one: one._replace(drone_probability=np.array([given[asked]])))
     assert len(flyer.step().detections) == found
 
 
