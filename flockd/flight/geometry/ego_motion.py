@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from flockd.core.config.geometry import GeometryParameters
@@ -14,22 +12,13 @@ from flockd.flight.geometry.rig import Rig, RigCamera
 from flockd.flight.geometry.robust.ransac import ransac_rigid
 from flockd.flight.geometry.transform import RigidTransform
 
-
-@dataclass(frozen=True)
-class EgoMotionAcceptance:
-    """Conditions for accepting a motion, by the matches that it explains."""
-
-    explained_px: float = 3.0
-    """A motion explains a match if it moves it to within this distance."""
-    min_explained: float = 0.08
-    """Least share of all matches that a motion explains. On real images true motions explain at least 15 %. Motions
-    found in false matches only, some of which always agree within metres, explain less than 6 %."""
-    min_kept: float = 0.9
-    """Least share of the explained matches that the refinement keeps; if it loses more, it has followed false
-    matches."""
-
-
-ACCEPTANCE = EgoMotionAcceptance()
+_EXPLAINED_PX = 3.0
+"""A motion explains a match if it moves it to within this distance."""
+_MIN_EXPLAINED = 0.08
+"""Least share of all matches that a motion explains. On real images true motions explain at least 15 %. Motions found
+in false matches only, some of which always agree within metres, explain less than 6 %."""
+_MIN_KEPT = 0.9
+"""Least share of the explained matches that the refinement keeps; if it loses more, it has followed false matches."""
 
 
 def estimate_ego_motion(pairs: PointPairs, rig: Rig, interval_s: float, parameters: GeometryParameters) -> EgoMotion:
@@ -53,12 +42,11 @@ def estimate_ego_motion(pairs: PointPairs, rig: Rig, interval_s: float, paramete
     if parameters.refine:
         refined = refine_ego_motion(pairs, rig, motion, found.inliers)
         still = _explained(by_camera, refined) / len(pairs)
-        if still >= ACCEPTANCE.min_kept * explained:
+        if still >= _MIN_KEPT * explained:
             motion, explained = refined, still
-    if explained < ACCEPTANCE.min_explained:
+    if explained < _MIN_EXPLAINED:
         raise ValueError(
-            f"the best motion explains only {explained:.1%} of {len(pairs)} matches within "
-            f"{ACCEPTANCE.explained_px:g} px"
+            f"the best motion explains only {explained:.1%} of {len(pairs)} matches within {_EXPLAINED_PX:g} px"
         )
     return EgoMotion(
         rotation=motion.rotation,
@@ -75,7 +63,7 @@ def _explained(by_camera: list[tuple[RigCamera, PointPairs]], motion: RigidTrans
     near = 0
     for camera, pairs in by_camera:
         u, v = (moved_pixels(camera, pairs.previous, motion) - pairs.pixels_current).T
-        near += int(np.count_nonzero(u * u + v * v < ACCEPTANCE.explained_px**2))  # NaN behind a camera compares false
+        near += int(np.count_nonzero(u * u + v * v < _EXPLAINED_PX**2))  # NaN behind a camera compares false
     return near
 
 
