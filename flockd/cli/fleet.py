@@ -10,7 +10,7 @@ import math
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
@@ -33,7 +33,6 @@ from flockd.cli.parser import (
 from flockd.core.errors import ExitCode, UnavailableError, UsageError
 
 if TYPE_CHECKING:
-    from flockd.core.messages import MissionOrder
     from flockd.fleet.page.page_server import PageServer
     from flockd.fleet.watcher import FleetWatcher
 
@@ -128,37 +127,30 @@ def _names(text: str) -> list[str]:
 
 
 def _goto(args: argparse.Namespace) -> int:
-    import numpy as np
-
-    from flockd.core.messages import MissionOrder
-
-    place = np.array([args.north, args.east])
     if args.degrees and not (abs(args.north) <= 90 and abs(args.east) <= 180):
         raise UsageError(f"{args.north:g} {args.east:g} is not a latitude and longitude; swap them, or drop --degrees")
-    where = {"place_deg": place} if args.degrees else {"place": place}
-    order = MissionOrder(height_m=args.height, speed_m_s=args.speed, **where)
+    north, east = ("latitude_deg", "longitude_deg") if args.degrees else ("north_m", "east_m")
+    order = {north: args.north, east: args.east, "height_m": args.height, "speed_m_s": args.speed}
     return _ask(args, "goto", order, repeat_s=math.inf if args.repeat else 0.0)
 
 
 def _velocity(args: argparse.Namespace) -> int:
-    import numpy as np
-
-    from flockd.core.messages import MissionOrder
-
-    order = MissionOrder(velocity=np.array([args.north, args.east]), height_m=args.height)
+    order = {"velocity_ne": [args.north, args.east], "height_m": args.height}
     return _ask(args, "velocity", order, repeat_s=args.seconds or 0.0)
 
 
-def _ask(args: argparse.Namespace, command: str, order: MissionOrder | None = None, repeat_s: float = 0.0) -> int:
+def _ask(
+    args: argparse.Namespace, command: str, order: Mapping[str, object] | None = None, repeat_s: float = 0.0
+) -> int:
     """Asks each drone as soon as it is found, whatever others do, again and again for ``repeat_s``.
 
-    Says what each answers, later only what has changed.
+    ``order``: an `OrderMessage`, with None for what was not said. Says what each drone answers, later only what has
+    changed.
     """
     from flockd.fleet.watcher import MAX_DRONES, FleetWatcher
-    from flockd.onboard.telemetry.order_messages import order_message
 
     listen, connect = endpoints(args)
-    message = None if order is None else {**order_message(order)}
+    message = None if order is None else {key: value for key, value in order.items() if value is not None}
     answers: dict[str, dict[str, object]] = {}
     over = threading.Event()
 

@@ -67,22 +67,6 @@ def parse_order(command: str, message: Mapping[str, object] | None) -> MissionOr
     )
 
 
-def order_message(order: MissionOrder) -> OrderMessage:
-    """The inverse of `parse_order`."""
-    message = OrderMessage()
-    if order.place is not None:
-        message["north_m"], message["east_m"] = order.place.tolist()
-    if order.place_deg is not None:
-        message["latitude_deg"], message["longitude_deg"] = order.place_deg.tolist()
-    if order.velocity is not None:
-        message["velocity_ne"] = order.velocity.tolist()
-    if order.height_m is not None:
-        message["height_m"] = order.height_m
-    if order.speed_m_s is not None:
-        message["speed_m_s"] = order.speed_m_s
-    return message
-
-
 def _object(payload: bytes) -> dict[str, Any]:
     if len(payload) > _LONGEST:
         raise ValueError(f"an order has {_LONGEST} bytes at most")
