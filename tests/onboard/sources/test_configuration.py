@@ -40,21 +40,6 @@ def _problems(folder: Path, source: str) -> list[str]:
     return [line.removeprefix(f"{folder}/") for line in str(caught.value).splitlines()]
 
 
-def test_the_quadrotors_file_is_four_wide_usb_cameras() -> None:
-    config = load_drone(QUADROTOR)
-    assert config.source is not None
-    assert [camera.name for camera in config.source.cameras] == ["front", "right", "back", "left"]
-    assert {camera.pixel_format for camera in config.source.cameras} == {"mjpeg"}
-    assert {camera.size_px for camera in config.rig.cameras} == {(480, 640)}
-    assert {camera.turn_deg for camera in config.source.cameras} == {90}
-    assert len({camera.device for camera in config.source.cameras}) == 4
-    for camera in config.source.cameras:
-        assert [control.name for control in camera.controls] == ["auto_exposure", "exposure_time_absolute", "gain"]
-    # An equidistant lens images 130 degrees on the height: r = f theta.
-    assert config.rig.cameras[0].intrinsics.fx * 1.1344640 == pytest.approx(320.0, abs=0.1)
-    assert isinstance(open_source(config, "quadrotor.yaml"), DeviceSource)
-
-
 TOPICS = """\
   cameras:
     - {name: front, topic: /front/image_raw}
