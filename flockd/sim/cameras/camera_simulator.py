@@ -143,7 +143,7 @@ class CameraSimulator:
                 )  # fmt: skip
 
             seen = lens_view(cameras[name].camera, draw)
-            if self._real is None:
+            if self._real is None or not self._real[drone, name].changes_views:
                 return seen.rgb
             motion = self._motion(drone, name, shots[name].shown_s, turns[name], trail)
             sun = self._world.light[0] @ turns[name]

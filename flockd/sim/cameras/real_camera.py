@@ -161,15 +161,19 @@ class RealCamera:
         self.shaking = Shaking(config.shake, np.random.default_rng([*seed, 1]))
         self._rng = np.random.default_rng([*seed, 3])
 
+    @property
+    def changes_views(self) -> bool:
+        """Whether `image` is another than the view that was drawn."""
+        config = self._config
+        faults = config.shutter.exposure_s, config.shutter.readout_s, config.lens.flare, config.noise.gain
+        return any(faults) or config.reduce > 1
+
     def image(self, view: View, motion: CameraMotion, sun: FloatArray) -> UInt8Array:
         """What the sensor sees, in the order of light: shutter, glass, noise by gain.
 
         ``sun`` (3,) is the unit vector towards it in the camera's axes. What is not configured changes no bit.
         """
         config, lens = self._config, self._lens
-        faults = config.shutter.exposure_s, config.shutter.readout_s, config.lens.flare, config.noise.gain
-        if not any(faults) and config.reduce == 1:
-            return view.rgb
         light = linear_light(view.rgb)
         light = exposed(light, view, lens, motion, config.shutter)
         if config.lens.flare:

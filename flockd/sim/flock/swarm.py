@@ -76,7 +76,7 @@ def fly(
         shown: where every drone's output is published; operators' orders come from there. A flight on exact states then
             takes as long as it takes in the air.
         recorders: one a drone, or none.
-        threads: for images; 0: all on the calling one, pilots too; None: as many as there are processors. Pilots that
+        threads: for images; 0: these and pilots on the calling one; None: as many as there are processors. Pilots that
             see step all at once.
         models: what each drone looks like; None: as the scenario says.
         pictured: keep key frames for the report.
@@ -256,8 +256,7 @@ class VisionPilots:
         ]  # fmt: skip
         with_pictures = [pictured and i in self._drones[:_KEY_FRAME_DRONES] for i in flying]
         results = self._map(self._step, flying, sets, states, with_pictures, map(orders.get, flying))
-        outputs: dict[int, PilotOutput] = {}
-        self.key_frames = []
+        outputs, self.key_frames = dict[int, PilotOutput](), []
         truth = None if self._companion is None else self._truth(step, time_s, vehicles, self._companion)
         for i, frames, state, (output, seen) in zip(flying, sets, states, results, strict=True):
             outputs[i] = output
