@@ -104,9 +104,9 @@ def _run(args: argparse.Namespace) -> int:
     if args.force and args.out is None:
         raise UsageError("--force has no meaning without --out; add it")
     drone = loaded(args.config)
-    camera = _camera_of_config(args, drone)
     left_out: list[str] = []
     pictures = find_pictures(args.pictures, but_not=args.out, left_out=left_out.append)
+    camera = _camera_of_config(args, drone)
     config = _perception(drone, args.drone_size)
     copies = None if args.out is None else Copies(args.out, pictures, overwrite=args.force)
     detected = list(_detected(args, pictures, PictureDetector(config), camera, copies, left_out))

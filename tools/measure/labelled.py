@@ -37,7 +37,14 @@ def read_labels(path: Path) -> dict[Path, list[Box]]:
         names = ", ".join(sorted(one["name"] for one in coco["categories"])) or "none"
         raise SystemExit(f"{path}: has no category `drone`, but {names}; rename that of the drones")
     files = {one["id"]: (path.parent / one["file_name"]).resolve() for one in coco["images"]}
+    if len(set(files.values())) < len(coco["images"]):
+        raise SystemExit(f"{path}: names a picture or an id of one twice; give each its own")
     sizes = {key: _size(file) for key, file in files.items()}
+    for one in coco["images"]:
+        said, here = (one.get("width"), one.get("height")), sizes[one["id"]]
+        if None not in said and said != here and np.isfinite(here).all():
+            told = f"is of {here[0]:g} x {here[1]:g} pixels, upright, and its labels of {said[0]} x {said[1]}"
+            raise SystemExit(f"{path}: {one['file_name']} {told}; label the pictures that are here")
     found: dict[Path, list[Box]] = {file: [] for file in files.values()}
     for one in coco["annotations"]:
         if one["category_id"] not in drones or one.get("iscrowd"):
@@ -47,7 +54,7 @@ def read_labels(path: Path) -> dict[Path, list[Box]]:
         fault = f"{path}: image {one['image_id']}: bbox {one['bbox']} in {wide:g} x {high:g} pixels"
         if max(one["bbox"]) <= 1:
             raise SystemExit(f"{fault} is in shares of it; write pixels: left, top, width, height")
-        if min(width, height) <= 0 or left + width > wide + 1 or top + height > high + 1 or min(left, top) < -1:
+        if not (-1 <= left < left + width <= wide + 1 and -1 <= top < top + height <= high + 1):
             raise SystemExit(f"{fault} ends outside it; write left, top, width, height, not the corners")
         found[files[one["image_id"]]].append((left, top, left + width, top + height))
     return found

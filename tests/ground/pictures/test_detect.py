@@ -245,7 +245,7 @@ def test_a_drones_own_camera_is_taken(told: Told, tmp_path: Path) -> None:
         ((NEAR,), 2, "the pictures' camera is not known; give its field of view with --fov"),
         ((NEAR, *FOV, "--camera", "front"), 2, "--camera is one of --config's, in place of --fov"),
         ((NEAR, *FOV, "--force"), 2, "--force has no meaning without --out"),
-        (("nowhere.jpg", *FOV), 2, "nowhere.jpg: does not exist; name an image, a video or a folder"),
+        (("nowhere.jpg",), 2, "nowhere.jpg: does not exist; name an image, a video or a folder"),
         ((LABELS, *FOV), 2, "drones.json: is not an image or a video by its name"),
         ((NEAR, *FOV, "--out", "drawn.jpg"), 2, "drawn.jpg: is not a folder; name one with --out, or a video"),
         ((NEAR, *FOV, "--out", "drawn.avi"), 2, "drawn.avi: is not a folder; name one with --out, or a video"),
@@ -378,6 +378,7 @@ def test_a_video_without_its_beginning_is_refused(told: Told, tmp_path: Path) ->
         (lambda x, y, w, h: [x, y, x + w, y + h], "ends outside it; write left, top, width, height, not the corners"),
         (lambda x, y, w, h: [x / 480, y / 360, w / 480, h / 360], "is in shares of it; write pixels"),
         (lambda x, y, w, h: [x, y, -w, h], "ends outside it"),
+        (lambda x, y, w, h: [x, y, math.nan, h], "ends outside it"),
     ],
 )
 def test_labels_that_cannot_be_of_the_pictures_are_refused(change: Any, fault: str, tmp_path: Path) -> None:
@@ -394,6 +395,14 @@ def test_labels_that_cannot_be_of_the_pictures_are_refused(change: Any, fault: s
         one["bbox"] = change(*one["bbox"])
     path.write_text(json.dumps(labels), encoding="utf-8")
     with pytest.raises(SystemExit, match=fault):
+        read_labels(path)
+    labels["images"][0] |= {"width": 960, "height": 720}
+    path.write_text(json.dumps(labels), encoding="utf-8")
+    with pytest.raises(SystemExit, match="is of 480 x 360 pixels, upright, and its labels of 960 x 720; "):
+        read_labels(path)
+    labels["images"][1]["id"] = 1
+    path.write_text(json.dumps(labels), encoding="utf-8")
+    with pytest.raises(SystemExit, match="names a picture or an id of one twice"):
         read_labels(path)
     labels["categories"] = [{"id": 1, "name": "quadcopter"}]
     path.write_text(json.dumps(labels), encoding="utf-8")
