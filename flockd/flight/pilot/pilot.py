@@ -103,6 +103,7 @@ class FlockPilot:
         self._own = OwnMotion(config.geometry.own_displacement_sigma_m)
         self._stopwatch = stopwatch
         self._first_time_s: float | None = None
+        self._first_height_m = math.nan
         self._last_time_s: float | None = None
         self._yaw_rad: float | None = None
         """The heading commanded last, without what the lookout adds; at first that of the first valid attitude."""
@@ -325,7 +326,7 @@ class FlockPilot:
         ground: GroundEstimate | None,
     ) -> Wanted:
         if self._first_time_s is None:
-            self._first_time_s = observation.time_s
+            self._first_time_s, self._first_height_m = observation.time_s, observation.vehicle.height_m
         seen = [n for n in neighbours if n.confirmed]
         places = np.array([n.position for n in seen]).reshape(-1, 3)
         velocities = np.array([n.velocity[:2] for n in seen]).reshape(-1, 2)
@@ -359,6 +360,10 @@ class FlockPilot:
         yaw_rad = self._lookout.heading(observation.time_s, self._yaw_rad, command, self._gone(observation))
         ends = guidance.takeover is not None
         height_m = self._size.height(observation.time_s, vehicle, ground, guidance.height_m, neighbours, ends=ends)
+        if ground is not None and ground.source == "range_finder":  # it may rise
+            floor_m = vehicle.height_m - ground.height_m + self._config.safety.gate.min_height_m
+            if floor_m > (self._first_height_m if height_m is None else height_m):
+                height_m = floor_m
         self._mission = replace(self._mission, sentence=self._mission.sentence + self._size.sentence)
         trim = self._trim()
         command = limit_norm(command + trim, self._config.safety.gate.max_speed_m_s)  # exact after rounding
