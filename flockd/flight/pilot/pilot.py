@@ -103,7 +103,8 @@ class FlockPilot:
         self._own = OwnMotion(config.geometry.own_displacement_sigma_m)
         self._stopwatch = stopwatch
         self._first_time_s: float | None = None
-        self._first_height_m = math.nan
+        self._first_height_m, self._floor_m = math.nan, -math.inf
+        """Height when the flight began, and the least one above the ground that a range showed last."""
         self._last_time_s: float | None = None
         self._yaw_rad: float | None = None
         """The heading commanded last, without what the lookout adds; at first that of the first valid attitude."""
@@ -199,6 +200,7 @@ class FlockPilot:
             tracker.predict(interval_s, moved, sigma_m)
             tracker.update(time_s, (), shown=lambda places, radius_m: np.zeros(len(places), np.bool_))
         ranges = local_map.step(time_s, None, None if moved is None else moved[:2], sigma_m)
+        height_m = self._floor_m if self._floor_m > self._first_height_m else None
         return PilotOutput(
             time_s=time_s,
             ego_motion=None,
@@ -206,7 +208,7 @@ class FlockPilot:
             detections=(),
             detection_tracks=(),
             neighbours=self._size.cautious(tracker.neighbours()),
-            command=Wanted(np.zeros(2), np.zeros(2), yaw_rad),
+            command=Wanted(np.zeros(2), np.zeros(2), yaw_rad, height_m=height_m),
             mission=self._mission,
             reasons=(reason,),
             counts={reason.text: 1},
@@ -361,9 +363,9 @@ class FlockPilot:
         ends = guidance.takeover is not None
         height_m = self._size.height(observation.time_s, vehicle, ground, guidance.height_m, neighbours, ends=ends)
         if ground is not None and ground.source == "range_finder":  # it may rise
-            floor_m = vehicle.height_m - ground.height_m + self._config.safety.gate.min_height_m
-            if floor_m > (self._first_height_m if height_m is None else height_m):
-                height_m = floor_m
+            self._floor_m = vehicle.height_m - ground.height_m + self._config.safety.gate.min_height_m
+        if self._floor_m > (self._first_height_m if height_m is None else height_m):
+            height_m = self._floor_m  # also when the range is lost: not down again into a hill
         self._mission = replace(self._mission, sentence=self._mission.sentence + self._size.sentence)
         trim = self._trim()
         command = limit_norm(command + trim, self._config.safety.gate.max_speed_m_s)  # exact after rounding

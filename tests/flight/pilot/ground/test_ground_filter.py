@@ -148,6 +148,10 @@ def test_before_ground_that_rises_it_climbs() -> None:
         low.vehicles.step(np.array([[-1.0, 0.0]]), np.zeros(1), STEP_S, np.array([0.0 if asked_m is None else asked_m]))
         low.time_s, low.steps = low.time_s + STEP_S, low.steps + 1
     assert min(above_m) >= 0.8 * low.scenario.drone.safety.gate.min_height_m
+    frames, state = low.take_frames()
+    for lost in (replace(state, height_m=math.nan), state):  # refused, and without a range: not down into the hill
+        asked = low.pilot.step(frames, lost).command.height_m
+        assert asked is not None and asked_m is not None and asked >= asked_m
 
 
 def test_without_a_range_there_is_no_scale_and_neighbours_are_seen_all_the_same(hilly: Flyer) -> None:
