@@ -105,6 +105,8 @@ class FlockPilot:
         self._first_time_s: float | None = None
         self._first_height_m, self._floor_m = math.nan, -math.inf
         """Height when the flight began, and the least one above the ground that a range showed last."""
+        self._height_m: float | None = None
+        """The height commanded last, as in `Wanted`."""
         self._last_time_s: float | None = None
         self._yaw_rad: float | None = None
         """The heading commanded last, without what the lookout adds; at first that of the first valid attitude."""
@@ -127,8 +129,8 @@ class FlockPilot:
             trace: filled with intermediate results; changes no output.
             order: an operator's order to the mission, in the first step after it arrived.
 
-        Impossible input is refused with a reason: the command is standstill. Of such a step the pilot keeps only the
-        order, and the heading if it had none.
+        Impossible input is refused with a reason: the command is standstill. It stands still at the height and
+        heading commanded last. Of such a step the pilot keeps only the order, and the heading if it had none.
         """
         self._order = self._order if order is None else order
         if self._yaw_rad is None and _is_rotation(vehicle.R_ned_body):
@@ -200,7 +202,6 @@ class FlockPilot:
             tracker.predict(interval_s, moved, sigma_m)
             tracker.update(time_s, (), shown=lambda places, radius_m: np.zeros(len(places), np.bool_))
         ranges = local_map.step(time_s, None, None if moved is None else moved[:2], sigma_m)
-        height_m = self._floor_m if self._floor_m > self._first_height_m else None
         return PilotOutput(
             time_s=time_s,
             ego_motion=None,
@@ -208,7 +209,7 @@ class FlockPilot:
             detections=(),
             detection_tracks=(),
             neighbours=self._size.cautious(tracker.neighbours()),
-            command=Wanted(np.zeros(2), np.zeros(2), yaw_rad, height_m=height_m),
+            command=Wanted(np.zeros(2), np.zeros(2), yaw_rad, height_m=self._height_m),
             mission=self._mission,
             reasons=(reason,),
             counts={reason.text: 1},
@@ -366,6 +367,7 @@ class FlockPilot:
             self._floor_m = vehicle.height_m - ground.height_m + self._config.safety.gate.min_height_m
         if self._floor_m > (self._first_height_m if height_m is None else height_m):
             height_m = self._floor_m  # also when the range is lost: not down again into a hill
+        self._height_m = height_m
         self._mission = replace(self._mission, sentence=self._mission.sentence + self._size.sentence)
         trim = self._trim()
         command = limit_norm(command + trim, self._config.safety.gate.max_speed_m_s)  # exact after rounding

@@ -254,6 +254,16 @@ def test_an_order_turns_a_hovering_drone_no_faster_than_images_allow() -> None:
     assert asked == pytest.approx([math.pi / 2 + 0.2 * i for i in range(3)])
 
 
+def test_where_a_step_is_refused_the_drone_stays_at_the_height_of_its_mission() -> None:
+    """Not at that of the flight's beginning, 4 m: between them may be a hill or another drone."""
+    mission = MissionParameters(kind="hover", height_m=7.0)
+    pilot = FlockPilot(changed(ALONE.drone, mission=mission), NEVER_ASKED)
+    for state in (vehicle(0.0, 4.0), replace(vehicle(1.0, 6.9), velocity_ned=np.full(3, math.nan))):
+        output = pilot.step(frames(state.time_s), state)
+    assert [reason.kind for reason in output.reasons] == [ReasonKind.INPUT]
+    assert output.command.height_m == 7.0
+
+
 def test_input_that_cannot_be_is_refused_and_the_next_step_is_as_if_it_had_not_come(flyer: Flyer) -> None:
     flyer.step()
     changes: dict[str, list[Any]] = {
