@@ -32,7 +32,7 @@ from flockd.cli import (
     status,
 )  # fmt: skip
 from flockd.cli.output import complain
-from flockd.cli.parser import Parser, commands_of
+from flockd.cli.parser import Parser, commands_of, require
 from flockd.core.errors import ExitCode, FlockdError, UnavailableError, shortage_of
 from flockd.core.jpeg_header import MAX_IMAGE_PIXELS
 
@@ -50,7 +50,7 @@ EXIT_CODES = """\
 exit codes:
   0    done
   1    a check failed
-  2    the command line is wrong
+  2    the command line is wrong, or a file that it names does not exist
   69   something is unavailable: an autopilot, a device, an optional package
   78   a configuration or a model is wrong
   130  interrupted by Ctrl-C; a report of what was flown is written"""
@@ -100,6 +100,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_IMAGE_PIXELS))  # before OpenCV is imported
     os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # before ONNX Runtime is imported: it keeps statistics
     try:
+        require(args)
         code: int = args.run(args)
         sys.stdout.flush()
     except FlockdError as error:

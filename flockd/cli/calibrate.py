@@ -8,9 +8,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flockd.cli.options import camera_of, loaded, opened, refuse_overwriting, require
+from flockd.cli.options import camera_of, loaded, opened, refuse_overwriting
 from flockd.cli.output import complain, progress, say_facts, say_result
-from flockd.cli.parser import Commands, Parser, commands_of, flag, option, positive_number, size
+from flockd.cli.parser import Commands, Parser, commands_of, existing, flag, option, positive_number, size
 from flockd.core.choices import LENS_MODELS
 from flockd.core.errors import UsageError
 
@@ -60,11 +60,11 @@ def _add_camera(commands: Commands) -> None:
     )
     description = "Measure a camera's lens from views of a ChArUco board."
     parser = commands("camera", description, examples, _camera)
-    option(parser, "SOURCE", "a folder of images (default: the live camera of --config)", nargs="?")
+    option(parser, "SOURCE", "a folder of images (default: the live camera of --config)", existing, nargs="?")
     option(parser, "--camera NAME", "the camera's name in the rig")
     option(parser, "--model", "lens model (default: the simplest that fits)", choices=LENS_MODELS)
     option(parser, "--print-board FILE", "write the board to print (.svg)", Path)
-    option(parser, "--config FILE", "the drone whose camera is used", Path)
+    option(parser, "--config FILE", "the drone whose camera is used", existing)
     _add_shared(parser, "CAMERA.yaml")
     board = parser.add_argument_group("the board", "as it was printed; measure it, printers shrink")
     option(board, "--squares CxR", "columns x rows (default: 7x5)", size, default=(7, 5))
@@ -137,8 +137,7 @@ def _images(args: argparse.Namespace, enough: Callable[[], bool]) -> tuple[str, 
     from flockd.ground.calibration import image_sources
 
     config = loaded(args.config)
-    path = None if args.source is None else Path(args.source)
-    if path is None:
+    if args.source is None:
         if config is None:
             raise UsageError("no SOURCE was given; name a folder of images, or --config for its camera")
         name = camera_of(config, args.camera, args.config)
@@ -146,19 +145,17 @@ def _images(args: argparse.Namespace, enough: Callable[[], bool]) -> tuple[str, 
     name = args.camera or "camera" if config is None else camera_of(config, args.camera, args.config)
     if not re.fullmatch("[a-z0-9_-]+", name):
         raise UsageError(f"--camera {name}: a camera's name has small letters, digits, _ and - only")
-    if path.is_dir():
-        return name, image_sources.from_folder(path)
-    fault = "does not exist; check the path"
-    if path.exists():
-        fault = "is no folder of images; name one, or for a live camera the drone with --config"
-    raise UsageError(f"{path}: {fault}")
+    if args.source.is_dir():
+        return name, image_sources.from_folder(args.source)
+    told = "is no folder of images; name one, or for a live camera the drone with --config"
+    raise UsageError(f"{args.source}: {told}")
 
 
 def _add_rig(commands: Commands) -> None:
     """Adds the command."""
     description = "Correct the rig by a recorded flight: the cameras' mountings, time offset and focal lengths."
     parser = commands("rig", description, ("flockd calibrate rig --from-flight drone1.mcap",), _rig)
-    option(parser, "--from-flight RECORDING", "a recording of the flight, with its images", Path, required=True)
+    option(parser, "--from-flight RECORDING", "a recording of the flight, with its images", existing, required=True)
     _add_shared(parser)
 
 
@@ -180,7 +177,7 @@ def _add_import(commands: Commands) -> None:
     examples = ("flockd calibrate import camchain.yaml", "flockd calibrate import lens.yml --size 640x480 --nearest")
     description = "Import the lenses of Kalibr's camchain, ROS's camera_info, OpenCV's FileStorage or COLMAP's list."
     parser = commands("import", description, examples, _import)
-    option(parser, "FILE", "the other program's file", Path)
+    option(parser, "FILE", "the other program's file", existing)
     option(parser, "--size WxH", "size of the images, if the file does not contain it", size)
     flag(parser, "--nearest", "use the nearest lens model if flockd lacks the file's")
     _add_shared(parser)
@@ -191,7 +188,6 @@ def _import(args: argparse.Namespace) -> int:
     from flockd.ground.calibration.foreign import camera_of_lens, foreign_lenses
     from flockd.ground.calibration.fragment import rig_text
 
-    require(args.file)
     out = args.out or Path("rig.yaml")
     refuse_overwriting(args, out)
     lenses = foreign_lenses(args.file, args.size)

@@ -9,9 +9,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flockd.cli.options import refuse, refuse_overwriting, require
+from flockd.cli.options import refuse, refuse_overwriting
 from flockd.cli.output import Phases, complain, say_result
-from flockd.cli.parser import Commands, commands_of, flag, option, positive_count
+from flockd.cli.parser import Commands, commands_of, existing, flag, option, positive_count
 from flockd.core.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ def add(commands: Commands) -> None:
         "flockd campaign config/campaigns/separation.yaml --workers 4 --out out/tonight",
     )
     parser = commands(RUN, "Fly the missing flights of a campaign, and write its report.", examples, _run, notes=COSTS)
-    option(parser, "FILE", "the campaign's file", Path)
+    option(parser, "FILE", "the campaign's file", existing)
     option(parser, "--out FOLDER", "folder of the results (default: out/NAME, by the campaign's name)", Path)
     option(parser, "--workers N", "flights at once (default: one a processor)", positive_count)
     flag(parser, "--dry-run", "print the number of flights and hours; fly and write nothing")
@@ -60,8 +60,8 @@ def add(commands: Commands) -> None:
     parser.set_defaults(quiet=False)
     examples = ("flockd campaign report out/separation", "flockd campaign report out/old_networks out/new_networks")
     parser = commands("report", "Write the report of a campaign, or compare a second one with it.", examples, _report)
-    option(parser, "FOLDER", "a campaign's folder", Path)
-    option(parser, "OTHER", "a second campaign's folder: are its figures better than FOLDER's?", Path, nargs="?")
+    option(parser, "FOLDER", "a campaign's folder", existing)
+    option(parser, "OTHER", "a second campaign's folder: are its figures better than FOLDER's?", existing, nargs="?")
     option(parser, "--out FILE", "file of the report (default: report.html in FOLDER)", Path)
     flag(parser, "--json", "print the figures as JSON")
 
@@ -140,7 +140,6 @@ def _rerun(args: argparse.Namespace) -> int:
 
 
 def _report(args: argparse.Namespace) -> int:
-    require(*(path for path in (args.folder, args.other) if path is not None))
     refuse_overwriting(args, args.out)
     from flockd.campaign.campaign_page import write_campaign_page
     from flockd.campaign.folder import REPORT_NAME

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from flockd.cli.options import add_force, add_settings, permit, refuse_overwriting
 from flockd.cli.output import complain, say, say_json, say_result
-from flockd.cli.parser import Commands, commands_of, flag, option
+from flockd.cli.parser import Commands, commands_of, existing, flag, option
 from flockd.core.errors import ConfigError, ConfigProblem, ExitCode, ModelError, UsageError
 
 if TYPE_CHECKING:
@@ -34,12 +34,14 @@ def add(commands: Commands) -> None:
     commands = commands_of(commands("config", "Check, show, describe and write configuration files.", examples))
     examples = ("flockd config check my_flight.yaml", "flockd config check --json config/*.yaml")
     parser = commands("check", "Report all errors in files of drones, scenarios and campaigns.", examples, _check)
-    parser.add_argument("files", nargs="+", metavar="FILE", type=Path, help="a drone's, scenario's or campaign's file")
+    parser.add_argument(
+        "files", nargs="+", metavar="FILE", type=existing, help="a drone's, scenario's or campaign's file"
+    )
     flag(parser, "--json", "print the problems as JSON")
     add_force(parser)
     examples = ("flockd config show config/paper_flight.yaml", "flockd config show --json config/simulator.yaml")
     parser = commands("show", "Show a file with every default filled in, a scenario with its drone.", examples, _show)
-    option(parser, "FILE", "a drone's or a scenario's file", Path)
+    option(parser, "FILE", "a drone's or a scenario's file", existing)
     flag(parser, "--json", "print JSON instead of YAML")
     examples = ("flockd config schema drone", "flockd config schema scenario > scenario.schema.json")
     description = "Print the JSON schema of a kind of file, for editors and other tools."
@@ -47,7 +49,7 @@ def add(commands: Commands) -> None:
     parser.add_argument("kind", choices=("drone", "scenario", "campaign"), help="kind of file")
     examples = ("flockd config card my_drone.yaml", "flockd config card /etc/flockd/drone.yaml > card.md")
     description = "Print the card of a flight day, as Markdown: limits, heights, reactions to faults, people's tasks."
-    option(commands("card", description, examples, _card), "FILE", "a drone's file", Path)
+    option(commands("card", description, examples, _card), "FILE", "a drone's file", existing)
     examples = (
         "flockd config new drone my_drone.yaml --set name=kite2 --set safety.first_flight_layer=2",
         "flockd config new scenario woods.yaml --set world.obstacles.kind=forest --set obstacles.enabled=true",

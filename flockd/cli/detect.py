@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from flockd.cli.options import camera_of, loaded
 from flockd.cli.output import complain, progress, say_facts, say_table
-from flockd.cli.parser import Commands, flag, number, option, positive_count
+from flockd.cli.parser import Commands, existing, flag, number, option, positive_count
 from flockd.core.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ def add(commands: Commands) -> None:
         "flockd detect photograph.jpg --fov 70 --drone-size 0.35",
     )
     parser = commands("detect", "Detect drones in pictures, with the code of the flight.", examples, _run, notes=NOTES)
-    option(parser, "PICTURES", "images, folders of them, videos", Path, nargs="+")
+    option(parser, "PICTURES", "images, folders of them, videos", existing, nargs="+")
     option(
         parser,
         "--out PATH",
@@ -73,7 +73,7 @@ def add(commands: Commands) -> None:
         "field of view across the longer side, of a lens without distortion; above 100, of a fisheye",
         number(f"an angle in degrees, {MIN_FOV_DEG:g} to {MAX_FOV_DEG:g}", MIN_FOV_DEG, MAX_FOV_DEG),
     )
-    option(camera, "--config FILE", "a drone, for its networks and settings and, without --fov, its camera", Path)
+    option(camera, "--config FILE", "a drone, for its networks and settings and, without --fov, its camera", existing)
     option(camera, "--camera NAME", "the camera of --config, if it has several")
 
 

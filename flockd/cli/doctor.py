@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from flockd.cli.options import add_force, load_to_fly, refuse
 from flockd.cli.output import Phases, progress, say, say_json, tables_console
-from flockd.cli.parser import Commands, flag, number, option
+from flockd.cli.parser import Commands, existing, flag, number, option
 from flockd.core.errors import ExitCode, UnavailableError, UsageError
 from flockd.core.printable import printable
 
@@ -47,7 +47,7 @@ def add(commands: Commands) -> None:
         "never arms, switches modes or sends setpoints."
     )
     parser = commands("doctor", description, examples, _run)
-    option(parser, "--config FILE", "the drone's configuration; with --demo by default the simulator's", Path)
+    option(parser, "--config FILE", "the drone's configuration; with --demo by default the simulator's", existing)
     option(parser, "--record DIR", "check this folder, in which `flockd run` will record", Path)
     seconds = number(f"a number of seconds from {LEAST_S:g} to 3600", LEAST_S, 3600)
     told = f"watch the cameras for S seconds (default: {SECONDS:g}), or fly the bench so long (default: 15)"

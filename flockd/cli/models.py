@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from flockd.cli.options import loaded
 from flockd.cli.output import complain, noted_table, progress, say, say_facts, say_json, tables_console
-from flockd.cli.parser import Commands, Parser, commands_of, flag, option
+from flockd.cli.parser import Commands, Parser, commands_of, existing, flag, option
 from flockd.core.errors import ExitCode, ModelError, UnavailableError
 
 if TYPE_CHECKING:
@@ -36,14 +36,14 @@ def add(commands: Commands) -> None:
         "engines is refused; OpenVINO starts sooner with them; CPU and CUDA need no engines."
     )
     parser = commands("prepare", description, examples, _prepare)
-    option(parser, "--config FILE", "the drone's configuration", Path, required=True)
+    option(parser, "--config FILE", "the drone's configuration", existing, required=True)
     flag(parser, "--json", "print JSON")
     description = (
         "Import a detector of your own for `perception.detector`: ONNX of a fixed size, as Ultralytics (YOLOv5, v8, "
         "11, 26) or YOLOX export it. Writes a copy that decodes its boxes, and its manifest; FILE stays as it is."
     )
     parser = commands("import", description, (_IMPORT,), _import)
-    option(parser, "FILE", "the ONNX file", Path)
+    option(parser, "FILE", "the ONNX file", existing)
     option(parser, "--drone CLASS", "the class of drones, by its name in FILE or its number from 0", required=True)
     told = "licence of the weights, for the manifest; networks trained with Ultralytics are under AGPL-3.0"
     option(parser, "--licence TEXT", told)
@@ -53,7 +53,7 @@ def add(commands: Commands) -> None:
 
 
 def _add_options(parser: Parser) -> Parser:
-    option(parser, "--dir", "folder of the manifests (default: flockd's own)", Path)
+    option(parser, "--dir", "folder of the manifests (default: flockd's own)", existing)
     flag(parser, "--json", "print JSON")
     return parser
 

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flockd.cli.output import complain, progress
-from flockd.cli.parser import OnceEach, Parser, flag, number, option, positive_number
-from flockd.core.errors import ConfigError, ConfigProblem, FlockdError, UsageError
+from flockd.cli.parser import OnceEach, Parser, existing, flag, number, option, positive_number
+from flockd.core.errors import ConfigError, ConfigProblem, UsageError
 from flockd.core.printable import printable
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ def add_endpoint_options(parser: Parser, listen: str = "--listen") -> None:
     option(parser, "--connect ENDPOINT", f"connect to this drone or router (default: {ENDPOINT})", action="append")
     told = "listen here for drones that connect to this computer"
     option(parser, f"{listen} ENDPOINT", told, action="append", dest="drones_at")
-    option(parser, "--zenoh-config FILE", "zenoh's own configuration file, for example for TLS", Path)
+    option(parser, "--zenoh-config FILE", "zenoh's own configuration file, for example for TLS", existing)
 
 
 def _fleet(text: str) -> str:
@@ -90,13 +90,6 @@ def _setting(text: str) -> tuple[str, str]:
     if not equals or re.fullmatch(r"\w+(\.\w+)*", key) is None:
         raise argparse.ArgumentTypeError(f"{text!r} is not a key and its value, as in seed=3")
     return key, value
-
-
-def require(*paths: Path) -> None:
-    """Raises FlockdError for a path that does not exist, before anything slow is imported."""
-    for path in paths:
-        if not path.exists():
-            raise FlockdError(f"{path}: does not exist; check the path")
 
 
 def add_stretch(parser: Parser) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, NoReturn, Protocol
 
 from flockd.cli.output import complain
-from flockd.core.errors import ExitCode
+from flockd.core.errors import ExitCode, UsageError
 from flockd.core.gone import COMMANDS
 
 Number = Callable[[str], float]
@@ -173,6 +173,21 @@ def _path(text: str) -> Path:
     if not text:
         raise argparse.ArgumentTypeError("'' is no path; name one")
     return Path(text)
+
+
+def existing(text: str) -> Path:
+    """The kind of an option that names what must be there; `require` checks it."""
+    return _path(text)
+
+
+def require(args: argparse.Namespace) -> None:
+    """Raises UsageError for the first of a command's `existing` paths that is missing: one exit code in all commands,
+    before anything slow is imported."""
+    for action in args.parser._actions:
+        given = getattr(args, action.dest, None) if action.type is existing else None
+        for path in given if isinstance(given, list) else [given] if given else []:
+            if not path.exists():
+                raise UsageError(f"{path}: does not exist; check the path")
 
 
 def flag(parser: argparse._ActionsContainer, name: str, what: str) -> None:

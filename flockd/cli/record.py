@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 from flockd.cli.options import opened
 from flockd.cli.output import say_facts
-from flockd.cli.parser import Commands, commands_of, flag, option
+from flockd.cli.parser import Commands, commands_of, existing, flag, option
 
 
 def add(commands: Commands) -> None:
@@ -15,7 +14,7 @@ def add(commands: Commands) -> None:
     commands = commands_of(commands("record", "Inspect recordings.", ("flockd record info drone1.mcap",)))
     examples = ("flockd record info drone1.mcap", "flockd record info --json drone1.mcap")
     parser = commands("info", "Show the contents of a recording: duration, gaps, damage, messages.", examples, _info)
-    option(parser, "RECORDING", "an MCAP file of flockd", Path)
+    option(parser, "RECORDING", "an MCAP file of flockd", existing)
     flag(parser, "--json", "print the result as JSON")
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from flockd.cli.options import add_stretch, loaded, opened, refuse, refuse_overwriting, stretch
 from flockd.cli.output import complain, progress, say, say_facts, say_json
-from flockd.cli.parser import Commands, OnceEach, Parser, flag, option, positive_count
+from flockd.cli.parser import Commands, OnceEach, Parser, existing, flag, option, positive_count
 from flockd.core.errors import ExitCode, UsageError
 
 if TYPE_CHECKING:
@@ -39,9 +39,9 @@ def add(commands: Commands) -> None:
     )
     description = "Run the pilot on a recorded flight again: the same frames and vehicle states, the same code."
     parser = commands("replay", description, examples, _run)
-    option(parser, "RECORDING", "a recording, or a dataset (see below)", Path)
+    option(parser, "RECORDING", "a recording, or a dataset (see below)", existing)
     add_stretch(parser)
-    option(parser, "--config FILE", "use the settings of this drone or scenario", Path)
+    option(parser, "--config FILE", "use the settings of this drone or scenario", existing)
     option(parser, "--out FILE", "write the replay as a new recording (.mcap)", Path)
     flag(parser, "--diff", "compare every output with the recorded one")
     flag(parser, "--profile", "show where time goes on this computer, and which step_s it can keep")

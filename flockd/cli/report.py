@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 from zipfile import BadZipFile
 
-from flockd.cli.options import opened, refuse, require
+from flockd.cli.options import opened, refuse
 from flockd.cli.output import complain, progress, show_summary
-from flockd.cli.parser import Commands, flag, option
+from flockd.cli.parser import Commands, existing, flag, option
 from flockd.core.errors import UsageError
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ def add(commands: Commands) -> None:
     parser.add_argument(
         "flight",
         metavar="RECORDING",
-        type=Path,
+        type=existing,
         help="a recording, a folder of them (each drone's newest), or the folder of a flight of `flockd sim`",
     )
     flag(parser, "--force", "overwrite an earlier report, or a flight in --out")
@@ -45,7 +45,6 @@ def add(commands: Commands) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    require(args.flight)
     from flockd.review.flight_log.log import FlightLog
     from flockd.review.report.flight_folder import (
         LOG_NAME,

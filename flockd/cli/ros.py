@@ -5,11 +5,10 @@ from __future__ import annotations
 import argparse
 import sys
 from contextlib import ExitStack, suppress
-from pathlib import Path
 
 from flockd.cli.options import add_endpoint_options, add_operator_option, endpoints
 from flockd.cli.output import complain, say
-from flockd.cli.parser import ALONE, Commands, Parser, commands_of, flag, option
+from flockd.cli.parser import ALONE, Commands, Parser, commands_of, existing, flag, option
 from flockd.core.errors import ExitCode
 
 _NOTES = """\
@@ -52,7 +51,7 @@ def _add_perceive(commands: Commands) -> None:
         "perceive", "Detect drones in the images of topics and publish them; command no vehicle.", examples, _perceive,
         notes=notes,
     )  # fmt: skip
-    option(parser, "--config FILE", "the drone's configuration, with `source`", Path, required=True)
+    option(parser, "--config FILE", "the drone's configuration, with `source`", existing, required=True)
     option(parser, "--vehicle TOPIC", "odometry, pose or IMU of the vehicle in REP 103's axes, or PX4's own odometry")
     _add_network(parser)
 

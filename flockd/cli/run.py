@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flockd.cli.options import add_force, load_to_fly
-from flockd.cli.parser import Commands, option
+from flockd.cli.parser import Commands, existing, option
 from flockd.core.errors import ExitCode, UnavailableError, UsageError
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ def add(commands: Commands) -> None:
     )
     description = "Fly this drone: from camera frames to setpoints for its autopilot, until SIGTERM or Ctrl-C."
     parser = commands("run", description, examples, _run)
-    option(parser, "--config FILE", "the drone's configuration", Path, required=True)
+    option(parser, "--config FILE", "the drone's configuration", existing, required=True)
     option(
         parser,
         "--record DIR",

@@ -20,7 +20,17 @@ from typing import TYPE_CHECKING, Any, get_args
 from flockd.cli.fleet import HERE, PORT, serve_page
 from flockd.cli.options import ENDPOINT, add_operator_option, add_settings
 from flockd.cli.output import Phases, complain, report_flight, say
-from flockd.cli.parser import Commands, flag, number, option, port_number, positive_count, positive_number, whole_number
+from flockd.cli.parser import (
+    Commands,
+    existing,
+    flag,
+    number,
+    option,
+    port_number,
+    positive_count,
+    positive_number,
+    whole_number,
+)
 from flockd.core.choices import AutopilotKind, SimulatedPerception
 from flockd.core.errors import ConfigError, ConfigProblem, ExitCode, UsageError
 
@@ -70,7 +80,7 @@ def add(commands: Commands) -> None:
         "flockd sim config/px4_flight.yaml --autopilot px4",
     )
     parser = commands("sim", "Fly a simulated flock, and write a report of the flight.", examples, _run, notes=COSTS)
-    option(parser, "SCENARIO", "the scenario's file (default: the paper's flight)", Path, nargs="?")
+    option(parser, "SCENARIO", "the scenario's file (default: the paper's flight)", existing, nargs="?")
     option(
         parser,
         "--perception",

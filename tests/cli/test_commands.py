@@ -108,6 +108,18 @@ def test_a_slip_on_the_command_line_is_a_usage_error(arguments: list[str], of: s
     assert f"see {of} --help" in error
 
 
+@pytest.mark.parametrize(
+    "command",
+    """run --config,status --zenoh-config,fleet hold all --zenoh-config,ros perceive --config,doctor --config,sim,
+    campaign run,campaign report,report,record info,replay,replay tests/review/replay/normal.mcap --config,detect,
+    detect docs/pictures/by_sight.webp --config,calibrate camera,calibrate camera --config,calibrate import,
+    calibrate rig --from-flight,config check,config check config/simulator.yaml,config show,config card,
+    models list --dir,models prepare --config,models import --drone 0""".replace("\n", "").split(","),
+)
+def test_a_missing_file_is_the_command_lines_fault_in_every_command(command: str, told: Told) -> None:
+    assert told(2, *command.split(), "nowhere") == "nowhere: does not exist; check the path\n"
+
+
 @pytest.mark.parametrize("command", [[], ["record"], ["config"], ["calibrate"]], ids=" ".join)
 def test_without_a_command_the_help_is_shown(command: list[str], capsys: Capture) -> None:
     assert main(command) == 2

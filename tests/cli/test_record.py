@@ -45,7 +45,6 @@ def test_info_tells_of_a_recording_that_was_cut_off(cut_off: Path, told: Told) -
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
-        (None, "does not exist"),
         (b"not a recording", "is not a recording (it does not begin as MCAP files do); name another file"),
         (b"version https://git-lfs.github.com/spec/v1\n", "is not a recording (but a pointer of Git LFS); fetch"),
         (b"#ROSBAG V2.0\n", "is not a recording (but a bag of ROS 1); make one of ROS 2 of it with `rosbags-convert`"),
@@ -54,11 +53,10 @@ def test_info_tells_of_a_recording_that_was_cut_off(cut_off: Path, told: Told) -
     ],
 )
 def test_what_cannot_be_read_is_one_sentence_and_leaves_nothing(
-    command: list[str], content: bytes | int | None, reason: str, path: Path, tmp_path: Path, told: Told
+    command: list[str], content: bytes | int, reason: str, path: Path, tmp_path: Path, told: Told
 ) -> None:
     bad = tmp_path / "bad.mcap"
-    if content is not None:
-        bad.write_bytes(content if isinstance(content, bytes) else path.read_bytes()[:content])
+    bad.write_bytes(content if isinstance(content, bytes) else path.read_bytes()[:content])
     before = set(tmp_path.iterdir())
     sentence = told(1, *command, bad)
     assert sentence.startswith(f"{bad}: ")

@@ -98,7 +98,7 @@ def find_pictures(
     ``left_out`` is called with a sentence about files of a folder that are not read.
 
     In folders, hidden files and the contents of ``but_not``, a folder of copies, are ignored. Raises UsageError for a
-    path that does not exist, is neither image nor video, or is a folder without any.
+    path that is neither image nor video, or is a folder without any.
     """
     endings = SUFFIXES | VIDEO_SUFFIXES
     copies = None if but_not is None else but_not.resolve()
@@ -116,8 +116,6 @@ def find_pictures(
                 left_out(f"{path}: {others}")
             for one in inside:
                 found.setdefault(one.resolve(), PictureFile(one, path))
-        elif not path.exists():
-            raise UsageError(f"{path}: does not exist; name an image, a video or a folder")
         elif not path.is_file():
             raise UsageError(f"{path}: is not an ordinary file; name an image, a video or a folder")
         elif path.suffix.lower() not in endings:

@@ -245,7 +245,6 @@ def test_a_drones_own_camera_is_taken(told: Told, tmp_path: Path) -> None:
         ((NEAR,), 2, "the pictures' camera is not known; give its field of view with --fov"),
         ((NEAR, *FOV, "--camera", "front"), 2, "--camera is one of --config's, in place of --fov"),
         ((NEAR, *FOV, "--force"), 2, "--force has no meaning without --out"),
-        (("nowhere.jpg",), 2, "nowhere.jpg: does not exist; name an image, a video or a folder"),
         ((LABELS, *FOV), 2, "drones.json: is not an image or a video by its name"),
         ((NEAR, *FOV, "--out", "drawn.jpg"), 2, "drawn.jpg: is not a folder; name one with --out, or a video"),
         ((NEAR, *FOV, "--out", "drawn.avi"), 2, "drawn.avi: is not a folder; name one with --out, or a video"),
