@@ -145,6 +145,9 @@ class Recording:
                 if entry.sequence != number:
                     yield from self._built(number, messages, start_s, end_s)
                     number, messages = entry.sequence, {}
+                if entry.stream.topic in messages:
+                    told = f"step {number} has two messages of {entry.stream.topic}"
+                    raise RecordingError(f"{self.path}: {told}; use another copy")
                 messages[entry.stream.topic] = entry.data
         yield from self._built(number, messages, start_s, end_s)
 
@@ -174,6 +177,8 @@ class Recording:
             raise RecordingError(f"{self.path}: step {number} lost its message {error}; use another copy") from error
         except (ValueError, RecordingError) as error:
             raise RecordingError(f"{self.path}: step {number} cannot be read ({error}); use another copy") from error
+        if len(frames) < len(listed.frames):
+            raise RecordingError(f"{self.path}: step {number} lists a camera twice; use another copy")
         yield RecordedStep(number, FrameSet(listed.time_s, frames), vehicle, output, truth, order)
 
     def _of_rig(self, camera: str, image: UInt8Array) -> UInt8Array:

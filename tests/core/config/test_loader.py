@@ -378,6 +378,8 @@ def test_steps_that_a_flight_would_wait_for_are_refused(
     [
         ("autopilot.address", "udpin://0.0.0.0:99999", "has the port 99999; write one from 1 to 65535"),
         ("autopilot.address", "serial:///dev/ttyAMA0:12345", "has the baud rate 12345, which no port has; write"),
+        ("autopilot.address", "serial:///dev/ttyAMA0:9600", "has the baud rate 9600, too slow for what the autopilot"),
+        ("autopilot.address", "serial:///dev/ttyAMA0:38400", "too slow for what the autopilot has to send; write"),
         ("autopilot.address", "serial:///dev/serial/by-path/usb-0:1:1", "has the baud rate 1, which no port has"),
         ("telemetry.listen", ("tcp/127.0.0.1:7447", "tls/0.0.0.0:70000?x=1"), "has the port 70000"),
         ("telemetry.connect", ("udp/10.0.0.1:65536",), "has the port 65536"),

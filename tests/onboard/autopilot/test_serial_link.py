@@ -11,11 +11,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pymavlink.dialects.v20 import development as mavlink
 
-from flockd.core.config.autopilot import AutopilotParameters
+from flockd.core.config.autopilot import LEAST_BAUD, AutopilotParameters
 from flockd.core.messages import Setpoint
 from flockd.onboard.autopilot.autopilot_status import AutopilotError
-from flockd.onboard.autopilot.mavsdk_link import AutopilotLink
+from flockd.onboard.autopilot.mavsdk_link import STREAMS_HZ, AutopilotLink
 from flockd.sim.autopilot.fake_autopilot import FakeAutopilot
 from tests.calm import clock
 from tests.onboard.autopilot.conftest import HEARTBEAT_S
@@ -84,6 +85,16 @@ async def test_no_other_program_can_open_it_whoever_starts_it(
         assert "Device or resource busy" in refused.stderr
     allowed = await asyncio.to_thread(opens)
     assert allowed.returncode == 0, allowed.stderr
+
+
+def test_the_least_baud_rate_carries_what_is_asked_for() -> None:
+    """With every field, as MAVLink 2 leaves out zeros at the end; 12 bytes around each message, ten bits a byte."""
+    bytes_a_second = sum(
+        (getattr(mavlink, f"MAVLink_{name.lower()}_message").unpacker.size + 12) * rate_hz
+        for name, (_, rate_hz) in STREAMS_HZ.items()
+        if name != "DISTANCE_SENSOR"
+    )
+    assert 38_400 < 10 * bytes_a_second <= LEAST_BAUD
 
 
 @pytest.mark.parametrize(

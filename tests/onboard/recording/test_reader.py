@@ -282,6 +282,27 @@ def test_a_step_without_its_vehicle_is_the_last_of_a_killed_one_or_an_error(tmp_
         list(Recording(odd.path).steps())
 
 
+def test_what_is_in_a_step_twice_is_refused_and_not_chosen_from(tmp_path: Path, whole: Path) -> None:
+    def doubled(one: Record) -> Record:
+        if not (isinstance(one, Entry) and one.stream.topic == "/frames" and one.sequence == 1):
+            return one
+        step = json.loads(one.data)
+        return replace(one, data=json.dumps({**step, "frames": [*step["frames"], step["frames"][0]]}).encode())
+
+    listed = Recording(rewritten(whole, tmp_path / "listed.mcap", doubled))
+    with pytest.raises(RecordingError, match="step 1 lists a camera twice; "):
+        list(listed.steps())
+    for topic in ("/vehicle", "/camera/left/image"):
+        with McapFile(tmp_path / f"{topic.replace('/', '')}.mcap") as file:
+            for one in read_records(whole):
+                assert not isinstance(one, Damage)
+                is_hit = isinstance(one, Entry) and one.stream.topic == topic and one.sequence == 2
+                for _ in range(1 + is_hit):
+                    file.write(one)
+        with pytest.raises(RecordingError, match=f"step 2 has two messages of {topic}; "):
+            list(Recording(file.path).steps())
+
+
 @pytest.mark.fault("killed-while-recording")
 def test_a_kill_loses_no_more_than_was_recorded_since_the_last_flush(tmp_path: Path) -> None:
     """What is on the disk half a second after a step, though too little to be written for its size."""
