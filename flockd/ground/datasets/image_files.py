@@ -25,19 +25,25 @@ class DatasetError(FlockdError):
     """A dataset, or a part of it, is missing, damaged or does not fit the other parts."""
 
 
-SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".tif", ".tiff", ".webp", ".avif"})
-UNREAD_SUFFIXES = frozenset(
-    {".heic", ".heif", ".jxl", ".mpo", ".tga", ".exr", ".hdr", ".svg", ".pdf"}
-    | {".jp2", ".gif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"}
-    | {".3gp", ".mts", ".ts", ".wmv", ".flv", ".insv"}
+def _suffixes(names: str) -> frozenset[str]:
+    return frozenset(f".{name}" for name in names.split())
+
+
+SUFFIXES = _suffixes("png jpg jpeg jfif jpe bmp pnm ppm pgm tif tiff webp avif")
+UNREAD_SUFFIXES = _suffixes(
+    "heic heif jxl mpo tga exr hdr svg pdf jp2 gif dng cr2 cr3 nef arw raf orf rw2 x3f gpr insp psd ico pbm pfm raw "
+    "yuv nv12 3gp 3g2 mts m2ts ts wmv flv insv ogv mjpeg mjpg h264 264 h265 265 hevc y4m"
 )
 """Kinds of pictures and videos that are not read; those of a folder are reported."""
-_WITH_PAGES = frozenset({".tif", ".tiff", ".webp", ".avif"})
+_WITH_PAGES = re.compile(rb"II\*\0|MM\0\*|GIF8|RIFF....WEBP|....ftypavi", re.DOTALL)
+"""First bytes of files that may hold several pages, whatever their name."""
 _PAGES = "has {} pages, of which one would be read; save each as an image"
 _PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND"
 _JPEG = b"\xff\xd8"
 MAX_FILE_BYTES = 1 << 29
 """Largest file: an uncompressed image of the largest permitted size with 16 bits, and some reserve."""
+_AVIF_HEAD = 4096
+"""Bytes in which the properties of an AVIF's image are."""
 _CHUNK_FRAME = 12
 """Bytes of a PNG chunk beside its data: length, name and checksum."""
 
@@ -65,6 +71,10 @@ def unread(files: Iterable[Path]) -> str | None:
     return ", and ".join(told) or None
 
 
+_USED_PERCENT = 99.9
+"""Of the values of an image with more than 8 bits; single hot pixels do not count."""
+
+
 def in_order(files: Iterable[Path]) -> list[Path]:
     """Sorts by name, with numbers as numbers: `frame2` comes before `frame10`."""
 
@@ -85,7 +95,8 @@ def read_image(path: Path, size: tuple[int, int] | None = None) -> UInt8Array:
         raise DatasetError(f"{path}: has pixels of {decoded.dtype}; save it with 8 or 16 bits a channel")
     image = cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB)
     if image.dtype == np.uint16:
-        image = np.right_shift(np.asarray(image, np.uint16), max(int(image.max()).bit_length() - 8, 0))
+        used_bits = int(np.percentile(image, _USED_PERCENT)).bit_length()
+        image = np.minimum(np.right_shift(np.asarray(image, np.uint16), max(used_bits - 8, 0)), 255)
     if size is not None:
         _check_size(path, image.shape[1::-1], size)
     return np.asarray(image, np.uint8)
@@ -114,14 +125,15 @@ def _decoded(path: Path, flags: int) -> cv2.typing.MatLike:
         else:
             data = path.read_bytes()
             data = data[: jpeg_end(data)]  # what cameras and phones write behind it is not looked at
-            fault = _fault(data) or _pages_fault(path)
+            fault = _fault(data) or _pages_fault(path, data)
             if fault is None:
                 with _stderr_of_libraries() as said:
                     image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
                     damage = said()
                 if image is not None and damage:
                     image, fault = None, f"is damaged inside ({damage})"
-            fault = fault or next((told for head, told in _OTHERS.items() if data.startswith(head)), "is no image")
+            others = (told for head, told in _OTHERS.items() if re.match(head, data, re.DOTALL))
+            fault = fault or next(others, "is no image")
     except (OSError, ValueError) as error:  # ValueError: what a list names cannot be a path
         fault = f"cannot be read ({error.strerror if isinstance(error, OSError) else error})"
     except cv2.error:  # of a header that claims more pixels than OpenCV is to take, or of no bytes at all
@@ -134,11 +146,16 @@ def _decoded(path: Path, flags: int) -> cv2.typing.MatLike:
     return image
 
 
+_CONVERT = "is of a format that is not read; save it as JPEG or PNG"
+_DAMAGED = "is damaged, or a kind of its format that is not read; restore it, or save it as PNG"
 _OTHERS = {
-    **dict.fromkeys((b"GIF8", b"P1", b"P2", b"P3", b"\0\0\0\x0cjP"), "is of a format that is not read; save it as PNG"),
-    **dict.fromkeys((b"\x1f\x8b", b"PK\x03\x04", b"\x28\xb5\x2f\xfd"), "is packed; unpack it"),
-    **dict.fromkeys((b"%PDF", b"<svg", b"<?xml"), "is a document; save its picture as PNG"),
-    LFS_POINTER: "is a pointer of Git LFS; fetch the file with `git lfs pull`",
+    rb"GIF8|P[1-37]\s|Pf\s|\0\0\0\x0c(jP|JXL)|\xff\n|\xffO\xffQ|....ftyp(hei|hev|mif|msf|crx)": _CONVERT,
+    rb"v/1\x01|#\?RADIANCE|8BPS|\0\0\x01\0": _CONVERT,
+    rb"\xff\xd8|II\*|MM\0|RIFF....WEBP|....ftypavi": _DAMAGED,
+    rb"....ftyp|\x1aE\xdf\xa3|RIFF....AVI ": "is a video by its contents; give its name that ending",
+    rb"\x1f\x8b|PK\x03\x04|\x28\xb5\x2f\xfd": "is packed; unpack it",
+    rb"%PDF|<svg|<\?xml|<!DOCTYPE|<html": "is a document; save its picture as PNG",
+    re.escape(LFS_POINTER): "is a pointer of Git LFS; fetch the file with `git lfs pull`",
 }
 """First bytes of files with an image's name that are no image."""
 
@@ -156,8 +173,10 @@ def _fault(data: bytes) -> str | None:
     return None
 
 
-def _pages_fault(path: Path) -> str | None:
-    pages = cv2.imcount(str(path)) if path.suffix.lower() in _WITH_PAGES else 1
+def _pages_fault(path: Path, data: bytes) -> str | None:
+    pages = cv2.imcount(str(path)) if _WITH_PAGES.match(data) else 1
+    if pages <= 1 and re.search(rb"\0\0\0\x09(irot[\1-\3]|imir)", data[:_AVIF_HEAD]) and data[4:8] == b"ftyp":
+        return "is turned or mirrored by its header, which is not read; save it as JPEG"
     return _PAGES.format(pages) if pages > 1 else None
 
 

@@ -136,6 +136,63 @@ def test_the_bits_that_an_image_uses_become_eight(bits: int, suffix: str, tmp_pa
     assert np.array_equal(read_image(path), image[..., ::-1])
 
 
+def test_a_hot_pixel_does_not_make_an_image_of_ten_bits_black(tmp_path: Path) -> None:
+    image, path = _photograph(), tmp_path / "x.png"
+    ten_bits = image.astype(np.uint16) << 2
+    ten_bits[60, 80] = 65535
+    cv2.imwrite(str(path), ten_bits)
+    image[60, 80] = 255
+    assert np.array_equal(read_image(path), image[..., ::-1])
+
+
+@pytest.mark.parametrize(
+    ("name", "head", "told"),
+    [
+        ("x.jpg", b"\0\0\0\x18ftypheic", "is of a format that is not read; save it as JPEG or PNG"),
+        ("x.png", b"\xff\x0a\x12", "is of a format that is not read"),
+        ("x.tif", b"8BPS\0\1", "is of a format that is not read"),
+        ("x.png", b"#?RADIANCE\n", "is of a format that is not read"),
+        ("x.jpg", b"\0\0\0\x18ftypisom", "is a video by its contents; give its name that ending"),
+        ("x.tif", b"II*\0\x08\0\0\0", "is damaged, or a kind of its format that is not read; restore it, or save"),
+        ("x.jpg", b"<!DOCTYPE html>", "is a document; save its picture as PNG"),
+        ("x.png", b"hello", "is no image; restore it"),
+    ],
+)
+def test_a_good_file_of_another_kind_is_not_called_a_broken_image(
+    name: str, head: bytes, told: str, tmp_path: Path
+) -> None:
+    (tmp_path / name).write_bytes(head + bytes(1000))
+    with pytest.raises(DatasetError, match=told):
+        read_image(tmp_path / name)
+
+
+def test_a_jpeg_of_twelve_bits_is_not_only_to_be_restored(tmp_path: Path) -> None:
+    data = bytearray(_written(".jpg"))
+    data[data.find(b"\xff\xc0") + 4] = 12
+    (tmp_path / "x.jpg").write_bytes(data)
+    with pytest.raises(DatasetError, match="or a kind of its format that is not read"):
+        read_image(tmp_path / "x.jpg")
+
+
+def test_pages_and_turns_count_by_the_contents_and_not_by_the_name(tmp_path: Path) -> None:
+    image = _photograph()
+    for form, name in ((".tif", "pages.jpg"), (".webp", "pages.png")):
+        cv2.imwritemulti(str(tmp_path / f"x{form}"), [image, 255 - image])
+        (tmp_path / f"x{form}").rename(tmp_path / name)
+        with pytest.raises(DatasetError, match="has 2 pages, of which one would be read"):
+            read_image(tmp_path / name)
+    turned = cv2.imencode(".avif", image)[1].tobytes()
+    assert read_image_of(tmp_path / "x.avif", turned).shape == (120, 160, 3)
+    colour = turned.index(b"\0\0\0\x10pixi")
+    with pytest.raises(DatasetError, match="is turned or mirrored by its header"):
+        read_image_of(tmp_path / "x.avif", turned[:colour] + b"\0\0\0\x09irot\1" + turned[colour:])
+
+
+def read_image_of(path: Path, data: bytes) -> UInt8Array:
+    path.write_bytes(data)
+    return read_image(path)
+
+
 def test_what_an_image_holds_that_is_not_read_is_said(tmp_path: Path) -> None:
     path, image = tmp_path / "x.tif", _photograph()
     cv2.imwritemulti(str(path), [image, image])
@@ -144,8 +201,8 @@ def test_what_an_image_holds_that_is_not_read_is_said(tmp_path: Path) -> None:
     cv2.imwrite(str(path), image.astype(np.float32) / 255)
     with pytest.raises(DatasetError, match="has pixels of float32; save it with 8 or 16 bits"):
         read_image(path)
-    assert unread([Path(f"a/{name}") for name in ("1.HEIC", "2.heic", "3.gif", "labels.json")]) == (
-        "pictures or videos of kinds that are not read (1 .gif, 2 .heic); convert them to JPEG, PNG or MP4"
+    assert unread([Path(f"a/{name}") for name in ("1.HEIC", "2.heic", "3.gif", "4.mjpeg", "labels.json")]) == (
+        "pictures or videos of kinds that are not read (1 .gif, 2 .heic, 1 .mjpeg); convert them to JPEG, PNG or MP4"
     )
 
 
