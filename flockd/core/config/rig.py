@@ -10,6 +10,7 @@ from pydantic import Field, model_validator
 
 from flockd.core.choices import LensModel
 from flockd.core.config.base import NonNegative, PlainName, Positive, Section, refuse, text
+from flockd.core.messages import FloatArray
 
 
 class MeasurementConfig(Section):
@@ -84,6 +85,14 @@ NARROWEST_DEG = 5.0
 WIDEST_DEG = {"pinhole": 130.0, "wide_angle": 220.0}
 
 
+_STRETCHED = {"pinhole": (0.4, 1.5), "wide_angle": (0.6, 1.5)}
+"""Distance from the middle in the image, relative to a lens without distortion. An orthographic fisheye has 0.42 at 65
+degrees as a pinhole, and 0.64 at 90 degrees as an equidistant lens, a stereographic one 1.49 at 110; telephoto lenses
+have less than 1.1."""
+_OFF_AXIS = 0.1
+"""The same for displacements by p1 and p2, of lenses that stand askew; of real ones it is a hundredth."""
+
+
 def _lens_faults(lens: IntrinsicsConfig, size: tuple[int, int]) -> dict[str, str]:
     """Reasons why a calibration is impossible for images of this size, by key."""
     words = f"{size[0]} x {size[1]} images"
@@ -105,21 +114,43 @@ def _lens_faults(lens: IntrinsicsConfig, size: tuple[int, int]) -> dict[str, str
         seen = "shows no direction at the border" if math.isnan(angle) else f"gives {angle:.0f} degrees"
         bounds = f"between {NARROWEST_DEG:g} and {WIDEST_DEG[lens.model]:g} can be of a {lens.model}"
         faults["fx"] = f"{lens.fx:g}, in pixels, {seen} of {words}, and {bounds}; {again}"
+    elif (fault := _distortion_fault(lens, angle)) is not None:
+        faults["distortion"] = f"{fault}, up to the border of {words}; {again}"
     return faults
+
+
+def _distortion_fault(lens: IntrinsicsConfig, angle_deg: float) -> str | None:
+    """Why no lens that sees ``angle_deg`` distorts like this."""
+    border = math.radians(angle_deg / 2) if lens.model == "wide_angle" else math.tan(math.radians(angle_deg / 2))
+    ideal, (least, most) = np.linspace(0.0, border, 100)[1:], _STRETCHED[lens.model]
+    stretched = _imaged(lens, ideal) / ideal
+    if stretched.min() < least or stretched.max() > most:
+        off = stretched.min() if stretched.min() < least else stretched.max()
+        known = f"real lenses to {least:.0%} to {most:.0%}"
+        return f"moves points to {off:.0%} of their distance from the middle, and {known}"
+    askew = 3.0 * border * max(map(abs, lens.distortion[2:4]), default=0.0) if lens.model == "pinhole" else 0.0
+    if askew > _OFF_AXIS:
+        return f"moves points by p1 and p2 by {askew:.0%} of their distance from the middle"
+    return None
 
 
 def field_of_view_deg(lens: IntrinsicsConfig, size: tuple[int, int]) -> float:
     """Field of view across the longer side, the principal point in its middle; NaN if the lens does not image the
     border."""
-    pinhole = lens.model == "pinhole"
-    radial = (*lens.distortion[:2], *lens.distortion[4:5]) if pinhole else lens.distortion
-    ideal = np.linspace(0.0, 10.0 if pinhole else math.pi, 2000)  # tangents to 84 degrees, or angles off the axis
-    imaged = ideal * (1.0 + sum(k * ideal ** (2 * power) for power, k in enumerate(radial, start=1)))
+    ideal = np.linspace(0.0, 10.0 if lens.model == "pinhole" else math.pi, 2000)  # tangents to 84 degrees, or angles
+    imaged = _imaged(lens, ideal)
     folds = np.flatnonzero(np.diff(imaged) <= 0.0)
     last = int(folds[0]) if len(folds) else len(ideal) - 1
     border = max(size) / 2 / (lens.fx if size[0] >= size[1] else lens.fy)
     at = float(np.interp(border, imaged[: last + 1], ideal[: last + 1], right=math.nan))
-    return math.degrees(2.0 * (math.atan(at) if pinhole else at))
+    return math.degrees(2.0 * (math.atan(at) if lens.model == "pinhole" else at))
+
+
+def _imaged(lens: IntrinsicsConfig, ideal: FloatArray) -> FloatArray:
+    """Distances from the middle (n,), in focal lengths, of points that a lens without distortion images at ``ideal``
+    (n,): tangents, or the angles off the axis."""
+    radial = (*lens.distortion[:2], *lens.distortion[4:5]) if lens.model == "pinhole" else lens.distortion
+    return ideal * (1.0 + sum(k * ideal ** (2 * power) for power, k in enumerate(radial, start=1)))
 
 
 class RigConfig(Section):

@@ -475,6 +475,16 @@ def test_how_wide_a_camera_sees() -> None:
         ((480, 640), {"cx": 320.0}, "cx", "320 is 17% of the image off the middle"),
         # Turns back at r = 0.82 of the focal length (1 - 3 * 0.5 r^2 = 0), where it images 0.54; the border is at 1.
         ((640, 480), {"distortion": (-0.5, 0.0, 0.0, 0.0)}, "fx", "shows no direction at the border"),
+        # The border is at r (1 + 5 r^2) = 1: r = 0.4725..
+        ((640, 480), {"distortion": (5.0, 0.0, 0.0, 0.0)}, "distortion", "to 212% of their distance from the middle"),
+        ((640, 480), {"distortion": (5.0, 5.0, 5.0, 5.0, 5.0)}, "distortion", "of their distance from the middle, and"),
+        ((640, 480), {"distortion": (0.0, 0.0, 0.04, 0.0)}, "distortion", "by p1 and p2 by 12% of their distance"),
+        (
+            (640, 480),
+            {"model": "wide_angle", "distortion": (5.0, 0.0, 0.0, 0.0)},
+            "distortion",
+            "to 212% of their distance from the middle, and real lenses to 60% to 150%, up to the border of 640 x 480",
+        ),
     ],
 )
 def test_a_calibration_that_cannot_be_true_is_refused(
