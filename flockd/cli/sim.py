@@ -126,8 +126,8 @@ def add(commands: Commands) -> None:
     flag(
         parser,
         "--live",
-        "fly on the fleet page in the browser, with what each drone sees, in real time where the computer can: send "
-        "drones to places, pause, slow down, disturb, restart; until Ctrl-C, without a report",
+        "show the flight on the fleet page in the browser, with the drones' cameras, in real time if the computer is "
+        "fast enough; the page commands the drones and the simulation. Flies until Ctrl-C, and writes no report",
     )
     option(parser, "--video FILE", "with --live: write an .mp4 of the flock and of what drone 1 sees", Path)
     option(parser, "--port N", f"with --live: port of the page (default: {PORT}; 0: any)", port_number)

@@ -59,7 +59,8 @@ def refusals_page() -> str:
         whats.append(reason.what)
         names.append(f"`{name}`")
     texts = {
-        remedy: re.sub("fails; its check", "fails;", "; ".join(dict.fromkeys(w))) for remedy, (w, _) in rows.items()
+        remedy: "; ".join(dict.fromkeys(whats)).replace("` fails; its check `", "`, `")
+        for remedy, (whats, _) in rows.items()
     }
     return _page(
         "Why the autopilot refuses",

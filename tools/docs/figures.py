@@ -129,11 +129,16 @@ def _flown(scenario: str, of: Part) -> str:
 
 
 def _each(parts: Mapping[str, Part]) -> str:
-    """The paper's flights by sight with the largest shape deviation."""
+    """The paper's flights by sight with the largest shape deviation, and the one with the lowest order."""
     of = parts["flights"][PAPERS]
     worst = sorted(of["sight"]["each"], key=lambda one: -one.get("shape_deviation_tail", math.inf))
     rows = [[f"{one[figure]:g}" if figure in one else "-" for figure in ("seed", *EACH)] for one in worst[:WORST]]
-    return _table(("seed", *map(_named, EACH)), rows) + "\n" + _origin(of)
+    low = min(of["sight"]["each"], key=lambda one: one["order_tail"])
+    told = (
+        f"Lowest order: seed {low['seed']}, {low['order_tail']:g}. From 10 s on no two of its drones came nearer than "
+        f"{low['min_distance_after_10s_m']:g} m; gates slowed them in {low['slowed_share']:g} of the time."
+    )
+    return _table(("seed", *map(_named, EACH)), rows) + f"\n\n{told}\n{_origin(of)}"
 
 
 def _paper(parts: Mapping[str, Part]) -> str:
@@ -174,7 +179,8 @@ def _px4(parts: Mapping[str, Part]) -> str:
          f"{one['longest_step_s']:.2f}", "kept" if one["kept"] else "not kept", one["modes"])
         for one in parts["px4"]["found"]
     ]  # fmt: skip
-    head = ("flight", "speed", "off, m/s", "truly", "order", "nearest, m", "longest step, s", "limit", "modes")
+    head = ("flight", "time factor", "deviation, m/s", "true deviation, m/s", "order", "nearest, m", "longest step, s",
+            "limit of the deviation", "modes")  # fmt: skip
     return _table(head, rows) + "\n" + _origin(parts["px4"])
 
 

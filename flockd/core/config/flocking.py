@@ -42,7 +42,7 @@ class FlockingParameters(Section):
     Eq. 39 attracts most. null: no limit, as in the paper. docs/concepts/flocking_law.md explains it."""
     size: Literal["off", "learn"] = "off"
     """`learn`: the drone estimates in flight the size of the others, the same for all, if the networks do not know it.
-    It moves up and down by 0.3 m for twelve seconds; the shift of the others' bearings gives their ranges and so their
+    It moves up and down by 0.3 m for twelve seconds. The shift of the others' bearings gives their ranges and so their
     size, which is used for all later ranges. If you know the size, write `perception.drone_size_m` instead."""
     own_weight: NonNegative = 1.0
     """W_i of Eq. 42"""

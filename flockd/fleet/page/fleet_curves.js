@@ -56,7 +56,11 @@ export class FleetCurves {
       xaxis: { ...axis, range: [-this.seconds(), 0], title: { text: "seconds before now", standoff: 4 } },
       yaxis: { ...axis, rangemode: ["clock", "temperature"].includes(this.select.value) ? "normal" : "tozero" },
     };
-    window.Plotly.react(this.plot, this.traces(ink), layout, { displayModeBar: false, displaylogo: false, responsive: true });
+    const traces = this.traces(ink);
+    if (!traces.some((trace) => trace.y.some((value) => value !== null))) {
+      layout.annotations = [{ text: "No drone has sent this yet.", xref: "paper", yref: "paper", x: 0.5, y: 0.5, showarrow: false }];
+    }
+    window.Plotly.react(this.plot, traces, layout, { displayModeBar: false, displaylogo: false, responsive: true });
   }
 
   // As long as there is something to show, and a minute at least.

@@ -200,7 +200,7 @@ def notice(inputs: Inputs, p: SafetyParameters) -> dict[Event, str]:
         *_beyond(
             {Event.FRAMES_DROPPED: p.max_dropped_share}, inputs.dropped_share, "{:.0%} of the frames were dropped"
         ),
-        *_older({Event.ESTIMATE_STALE: p.estimate_timeout_s}, inputs.estimate_age_s, "no estimate"),
+        *_older({Event.ESTIMATE_STALE: p.estimate_timeout_s}, inputs.estimate_age_s, "no output of the pilot"),
         *_older(ego_motion, inputs.ego_motion_age_s, "no ego-motion estimated"),
         (Event.NETWORK_FAULT, inputs.network_faults > 0, "a network's output is not finite or not plausible"),
         (Event.INFERENCE_STUCK, inputs.inference_stuck, "a network does not respond"),
@@ -213,7 +213,7 @@ def notice(inputs: Inputs, p: SafetyParameters) -> dict[Event, str]:
         (Event.VELOCITY_OFF, is_off and not far_off, off),
         (Event.VELOCITY_FAR_OFF, too_far_off and not inputs.obstacle_near, cause),
         (Event.NO_ROOM_TO_HOLD, too_far_off and inputs.obstacle_near, f"{cause}; {room}"),
-        (Event.TASK_DIED, len(inputs.dead_tasks) > 0, f"stopped unexpectedly: {', '.join(inputs.dead_tasks)}"),
+        (Event.TASK_DIED, len(inputs.dead_tasks) > 0, f"a task stopped unexpectedly: {', '.join(inputs.dead_tasks)}"),
         *_older({Event.NEIGHBOURS_LOST: p.neighbours_timeout_s}, inputs.neighbours_age_s, "no neighbour seen"),
         (Event.NEIGHBOUR_CLOSE, not inputs.nearest_neighbour_m >= p.gate.min_separation_m, close),
         (Event.COMMAND_REFUSED, inputs.refused_commands > 0, "a command was not finite or far too large"),

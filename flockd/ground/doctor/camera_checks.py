@@ -157,14 +157,14 @@ def coverage(rig: RigConfig) -> Finding:
     built = build_rig(rig)
     seen = _seen_around(built, 0)
     if not seen.any():
-        return failed("rig", "no camera sees the horizon", "fix the cameras' extrinsics")
+        return failed("coverage", "no camera sees the horizon", "fix the cameras' extrinsics")
     if not seen.all():
         measured = f"blind at the horizon {' and '.join(_gaps(~seen))}, clockwise from forward: neighbours there are"
-        return warned("rig", f"{measured} not seen", "turn, widen or add cameras, or fix their extrinsics")
+        return warned("coverage", f"{measured} not seen", "turn, widen or add cameras, or fix their extrinsics")
     blind = (deg for deg in range(1, 90) if not (_seen_around(built, deg).all() and _seen_around(built, -deg).all()))
     reach_deg = next(blind, 91) - 1
     measured = f"{len(rig.cameras)} cameras see all of the horizon, and all around to {reach_deg} degrees off it"
-    return passed("rig", measured)
+    return passed("coverage", measured)
 
 
 def _seen_around(rig: Rig, down_deg: int) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:

@@ -118,8 +118,8 @@ def facts(summary: Summary, log: FlightLog) -> Iterator[dict[str, str]]:
     if summary["drones"] > 1 and summary["has_truth"]:
         yield _fact("Closest two drones", flock["min_distance_m"], 2, f"in 3D, {_closest(log)}", "m")
         hovers = flock["order_tail"] is None
-        yield _fact("Order", flock["order_tail"], 3, "the flock hovers" if hovers else "1 is all flying one way")
-        yield _fact("Union", flock["union_tail"], 2, "1 is one connected flock")
+        yield _fact("Order", flock["order_tail"], 3, "the flock hovers" if hovers else "1: all fly in the same direction")
+        yield _fact("Union", flock["union_tail"], 2, "1: the flock is connected")
     if summary["has_truth"]:
         heights = -log.position[..., 2]
         yield _fact("Heights", f"{heights.min():.1f}–{heights.max():.1f}", 1, "above the start’s ground", "m")
@@ -148,7 +148,7 @@ def facts(summary: Summary, log: FlightLog) -> Iterator[dict[str, str]]:
         yield _fact("Own motion", known and 100 * known, 1, "of the steps, from the second on", "%")
         yield _fact("Neighbours tracked", most, 0, "at most at one time")
     if summary["realtime_factor"] is not None:
-        yield _fact("Speed", summary["realtime_factor"], 2, "of real time", "×")
+        yield _fact("Simulation speed", summary["realtime_factor"], 2, "as fast as reality", "×")
 
 
 def _fact(name: str, value: float | str | None, digits: int, remark: str, unit: str = "") -> dict[str, str]:

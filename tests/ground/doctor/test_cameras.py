@@ -68,7 +68,7 @@ def test_two_cameras_that_run_as_they_should() -> None:
         assert finding.level is Level.PASS, finding
         assert "30.0 of 30 images a second, jitter 0.0 ms, no gaps, 2 controls accepted" in finding.measured
         assert "calibration fits 640x480, 94 degrees" in finding.measured
-    assert found["rig"][0].level is Level.WARNING, "both look forward"
+    assert found["coverage"][0].level is Level.WARNING, "both look forward"
     assert not kernel.open_files, "all are given back"
     with filming(kernel, "front"):
         found = _examined(_config("front", controls=()), kernel)
