@@ -188,7 +188,7 @@ def _px4_stories(parts: Mapping[str, Part]) -> str:
     """The stories by outcome, each with its cases in brackets."""
     told: dict[str, dict[str, list[str]]] = {}
     for story, end in parts["px4_stories"]["found"].items():
-        name, _, case = story.rstrip("]").partition("[")
+        name, _, case = story.replace("px4 1 18", "PX4 1.18").replace("px4", "PX4").rstrip("]").partition("[")
         told.setdefault(end, {}).setdefault(name, []).append(case)
     rows = []
     for end, stories in told.items():

@@ -34,7 +34,7 @@ PURPOSES: Mapping[str, str] = {
 _ROW, _COLUMN, _BOX, _TOP = 36, 23, 262, 78
 _WIDTH, _HEIGHT = 1050, 412
 _STYLE = (
-    "text{fill:#1b2430}.n{font-weight:bold}.s{fill:#4a5665;font-size:14px}.b{fill:#eef4fa;stroke:#0072b2}"
+    "text{fill:#1b2430}.n{font-weight:bold}.s{fill:#4a5665;font-size:13px}.b{fill:#eef4fa;stroke:#0072b2}"
     ".d{fill:#ecf7f2;stroke:#009e73}.o{fill:#d55e00}.x{fill:none;stroke:#c3cbd5}"
 )
 
@@ -71,7 +71,7 @@ def _list(title: str, order: Sequence[str], uses: Mapping[str, set[str]], left: 
         kind = "d" if name in flies else "b"
         lines.append(f'  <rect class="{kind}" x="{left}" y="{y}" width="{_BOX}" height="{_ROW - 6}" rx="6"/>')
         lines.append(f'  <text class="n" x="{left + 8}" y="{middle + 5}">{name}</text>')
-        lines.append(f'  <text class="s" x="{left + 108}" y="{middle + 4}">{PURPOSES[name]}</text>')
+        lines.append(f'  <text class="s" x="{left + 112}" y="{middle + 4}">{PURPOSES[name]}</text>')
         for column, other in enumerate(order):
             x = left + _BOX + 16 + column * _COLUMN
             if row == 0:

@@ -34,7 +34,7 @@ class ObstacleParameters(Section):
     margin_m: Annotated[float, Field(ge=0, le=20)] = 0.5
     """Added to the clearance if there is room."""
     horizon_s: _Seconds = 3.0
-    """A direction is free if the drone meets no obstacle within this time at the wanted speed; among neighbours at most
-    at 1.5 m/s, or at theirs if that is faster."""
+    """A direction is free if the drone meets no obstacle within this time at the wanted speed. Among neighbours this
+    speed counts up to 1.5 m/s, or up to theirs if that is faster."""
     sigmas: Annotated[float, Field(ge=0, le=10)] = 2.0
     """Number of standard deviations by which an obstacle is assumed nearer than measured."""

@@ -72,7 +72,7 @@ class MissionParameters(Section):
     """After the last of the `waypoints`: keep the flock there, or ask the autopilot to land or to return home."""
     reached_m: Distance = 1.0
     """A goal is reached when the flock's middle (of this drone and the neighbours that it sees) is within this
-    distance, or came near it and comes no nearer. For flocks of a hundred write about the flock's radius."""
+    distance, or near it without coming nearer. For flocks of a hundred write about the flock's radius."""
     timeout_s: Annotated[float, Field(gt=0, le=60)] = 2.0
     """Duration of an operator's velocity, and with kind `operator` of a goal; then the drone hovers."""
     pull: NonNegative = 1.0

@@ -24,11 +24,11 @@ class TrackingParameters(Section):
     """Duration of an acceleration. The white acceleration noise of the motion model has the spectral density
     acceleration_sigma_m_s2^2 * manoeuvre_time_s (Bar-Shalom, Li & Kirubarajan 2001, section 6.2)."""
     relative_speed_sigma_m_s: Positive = 0.7
-    """Standard deviation, each axis, of a flock mate's relative velocity before it is measured, and long after the last
-    measurement: its velocity tends to the own velocity."""
+    """Standard deviation, each axis, of a flock mate's relative velocity before the first measurement, and long after
+    the last one: the estimate then tends to the own velocity."""
     speed_sigma_m_s: Positive = 2.0
-    """Standard deviation of the closing speed of a drone outside the flock; and, each axis, of the velocity of any
-    drone while the own velocity is not known."""
+    """Standard deviation of the closing speed of a drone outside the flock. While the own velocity is not known, that
+    of any drone's velocity, each axis."""
     stranger_probability: Probability = 0.2
     """Probability that a new drone, or one that changes its motion, flies a course of its own; half of this that it
     brakes to standstill. The tracker follows all motions, and detections weigh them (IMM: Blom & Bar-Shalom 1988)."""
@@ -87,8 +87,8 @@ class TrackingParameters(Section):
     drop_probability: Probability = 0.1
     """Existence probability below which a track is deleted."""
     max_unseen_s: Duration = 1.5
-    """A track is deleted, whatever its existence probability, after it should have been in view without a detection for
-    this time and for a tenth of its age. A confirmed neighbour that leaves the cameras' view is kept until then."""
+    """A track is deleted when cameras looked at its place for this time, and for a tenth of its age, without detecting
+    it, even at a high existence probability. A confirmed neighbour that leaves the cameras' view is kept until then."""
 
     def confirm_steps(self, step_s: float) -> int:
         """The first step, of length `step_s`, in which a neighbour that is detected in every step can be confirmed."""
