@@ -32,7 +32,7 @@ from flockd.core.messages import (
 )
 from flockd.core.navigation import wrapped
 from flockd.flight.flocking import FlockingLaw
-from flockd.flight.flocking.passing import Passing
+from flockd.flight.flocking.passing import HORIZON_S, Passing
 from flockd.flight.geometry import build_rig, estimate_ego_motion
 from flockd.flight.geometry.level import limit_norm
 from flockd.flight.mission import Moment, Navigator
@@ -351,7 +351,7 @@ class FlockPilot:
         own = guidance.velocity if velocity is None else velocity[:2]  # before the first pair: the mission's
         if self._ranging is None:
             tracks = [n.track for n in seen]
-            limits = limits_towards(neighbours, vehicle.position, self._config.safety.gate)
+            limits = limits_towards(neighbours, vehicle.position, self._config.safety.gate, HORIZON_S)
             command, acceleration = self._passing.command(
                 own, places, velocities, desired, self._config.step_s, tracks, limits, ages_s
             )

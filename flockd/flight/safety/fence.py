@@ -25,12 +25,13 @@ def outside_heights(parameters: GateParameters, height_m: float) -> bool:
     return not parameters.min_height_m - HEIGHT_NOISE_M <= height_m <= parameters.max_height_m + HEIGHT_NOISE_M
 
 
-def towards_fence(p: GateParameters, position: FloatArray) -> Limits:
+def towards_fence(p: GateParameters, position: FloatArray, flies_on_s: float = 0.0) -> Limits:
     """Directions (n, 2) to the fences, or outward if one was left, and the greatest speed towards each, (n,) m/s.
 
     A fence counts as a wall with `obstacle_clearance_m`: see `stopping_speed`. Outside it the speed outward is zero. A
     round one limits the speed along it too: a vehicle that responds late leaves a circle along the tangent. A
-    `position` that is not finite gives no direction.
+    `position` that is not finite gives no direction. The drone may fly on for `flies_on_s` before it brakes, and for
+    its reaction time at least.
     """
     offsets: list[FloatArray] = []
     left_m: list[float] = []
@@ -55,7 +56,8 @@ def towards_fence(p: GateParameters, position: FloatArray) -> Limits:
     directions = np.reshape(offsets, (len(offsets), 2))
     lengths = np.hypot(directions[:, 0], directions[:, 1])
     somewhere = lengths > 0
-    most_m_s = stopping_speed(np.array(left_m) - p.obstacle_clearance_m, p.braking_m_s2, p.reaction_s)
+    reaction_s = max(p.reaction_s, flies_on_s)
+    most_m_s = stopping_speed(np.array(left_m) - p.obstacle_clearance_m, p.braking_m_s2, reaction_s)
     return directions[somewhere] / lengths[somewhere, None], most_m_s[somewhere]
 
 

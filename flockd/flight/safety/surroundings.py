@@ -56,15 +56,18 @@ def surroundings(
     )
 
 
-def limits_towards(neighbours: Sequence[Neighbour], position: FloatArray | None, p: GateParameters) -> Limits:
+def limits_towards(
+    neighbours: Sequence[Neighbour], position: FloatArray | None, p: GateParameters, flies_on_s: float = 0.0
+) -> Limits:
     """Directions (k, 2) to neighbours and the fence, and the greatest speed, (k,) m/s, that the gate permits there as
     the step ends.
 
-    For a pilot, so that it does not command what the gate refuses. `position` (2,) m from home; None: not known.
+    For a pilot, so that it does not command what the gate refuses. `position` (2,) m from home; None: not known. Before
+    the fence the drone has room to fly on for `flies_on_s`.
     """
     places, velocities, margins, unseen_s = _motions(neighbours, 0.0, np.zeros(3))
     near = towards_neighbours(p, places, velocities, p.min_separation_m, margins, unseen_s)
-    fence = NO_LIMITS if position is None else towards_fence(p, position)
+    fence = NO_LIMITS if position is None else towards_fence(p, position, flies_on_s)
     return np.concatenate([near[0], fence[0]]), np.concatenate([near[1], fence[1]])
 
 

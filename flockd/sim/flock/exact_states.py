@@ -11,7 +11,7 @@ from scipy.special import ndtri
 
 from flockd.core.messages import BoolArray, FloatArray, MissionOrder, MissionStatus, Neighbour
 from flockd.flight.flocking import FlockingLaw
-from flockd.flight.flocking.passing import Passing
+from flockd.flight.flocking.passing import HORIZON_S, Passing
 from flockd.flight.geometry import build_rig, rotation_from_euler
 from flockd.flight.mission import Moment, Navigator
 from flockd.flight.mission.navigator import Lookout, middle_of
@@ -95,7 +95,7 @@ class ExactFlock:
             if around is not None and self._avoids:
                 flown_as = self._avoidances[i].command(self._law, moving, places, others, desired, around, ages_s)
             elif self._passes:
-                tracks, limits = [one.track for one in seen], limits_towards(known[i], here, self._gate)
+                tracks, limits = [one.track for one in seen], limits_towards(known[i], here, self._gate, HORIZON_S)
                 flown_as = self._passings[i].command(
                     moving, places, others, desired, self._step_s, tracks, limits, ages_s
                 )

@@ -121,6 +121,8 @@ def test_a_pilot_hears_how_fast_the_gate_lets_it_fly_towards_each() -> None:
     assert limits_towards([known(here, sigma=0.5)], None, p)[1].min() < 1.0, "in doubt"
     directions, most_m_s = limits_towards([], np.array([99.0, 0.0]), p)  # 1 m before the fence, of which 0.6 m are kept
     assert most_m_s[directions[:, 0] > 0.99].tolist() == [pytest.approx(math.sqrt(0.75**2 + 3 * 0.4) - 0.75)]
+    directions, most_m_s = limits_towards([], np.array([99.0, 0.0]), p, 2.5)  # 2.5 v + v^2 / 3 = 0.4
+    assert most_m_s[directions[:, 0] > 0.99].tolist() == [pytest.approx(math.sqrt(3.75**2 + 3 * 0.4) - 3.75)]
 
 
 @pytest.mark.parametrize("velocity", [(0.0, 0.0), (math.nan, math.nan), (math.nan, 1.0)])
