@@ -363,10 +363,17 @@ class FlockPilot:
         yaw_rad = self._lookout.heading(observation.time_s, self._yaw_rad, command, self._gone(observation))
         ends = guidance.takeover is not None
         height_m = self._size.height(observation.time_s, vehicle, ground, guidance.height_m, neighbours, ends=ends)
-        if ground is not None and ground.source == "range_finder":  # it may rise
-            self._floor_m = vehicle.height_m - ground.height_m + self._config.safety.gate.min_height_m
-        if self._floor_m > (self._first_height_m if height_m is None else height_m):
-            height_m = self._floor_m  # also when the range is lost: not down again into a hill
+        rises_m = 0.0
+        if ground is not None and ground.source == "range_finder":  # it may rise, before a climb is flown too
+            gate, steepest = self._config.safety.gate, self._config.perception.range_finder.max_slope
+            climbs_s = self._config.step_s + gate.neighbour_reaction_s
+            self._floor_m = vehicle.height_m - ground.height_m + gate.min_height_m
+            rises_m = climbs_s * max(float(ground.slope @ own), 0.0)
+            most_m, room_m = climbs_s * steepest * math.hypot(*command), ground.height_m - gate.min_height_m / 2
+            if most_m > room_m:
+                command = command * max(room_m / most_m, 0.0)
+        if self._floor_m + rises_m > (self._first_height_m if height_m is None else height_m):
+            height_m = self._floor_m + rises_m  # also when the range is lost: not down again into a hill
         self._height_m = height_m
         self._mission = replace(self._mission, sentence=self._mission.sentence + self._size.sentence)
         trim = self._trim()

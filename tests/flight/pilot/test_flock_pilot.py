@@ -15,17 +15,21 @@ from flockd.core.config.mission import MissionParameters
 from flockd.core.messages import (
     SECTORS,
     Float32Array,
+    FloatArray,
     Frame,
     FrameSet,
     MissionOrder,
     Reason,
     ReasonKind,
     VehicleState,
+    Wanted,
 )
 from flockd.flight.geometry import RigCamera, rotation_angle_deg, rotation_from_euler
 from flockd.flight.perception import Observation, SceneMaps
 from flockd.flight.pilot import FlockPilot
 from flockd.flight.tracking import Tracker
+from flockd.sim.scenario import SensorConfig, StartConfig, VehicleConfig
+from flockd.sim.vehicles.vehicles import SimulatedAutopilot, Vehicles
 from tests.flight.pilot.flyer import STEP_S, Flyer, SpoilableTruth, scenario_with
 from tests.make import changed, detection, frames, neighbour, vehicle
 
@@ -262,6 +266,38 @@ def test_where_a_step_is_refused_the_drone_stays_at_the_height_of_its_mission() 
         output = pilot.step(frames(state.time_s), state)
     assert [reason.kind for reason in output.reasons] == [ReasonKind.INPUT]
     assert output.command.height_m == 7.0
+
+
+@pytest.mark.parametrize(
+    ("slope", "speed_m_s", "climbs", "least_m"), [(0.15, 1.0, True, 0.8), (0.3, 1.2, True, 0.8), (0.2, 1.0, False, 0.2)]
+)
+def test_before_ground_that_rises_it_climbs_or_else_stops(
+    slope: float, speed_m_s: float, climbs: bool, least_m: float
+) -> None:
+    """2 m above the ground, which rises from 6 m on, with the autopilot's errors and response: 1 m is to be kept. Or
+    another drone above prevents the climb."""
+    mission = MissionParameters(kind="velocity", velocity_m_s=(speed_m_s, 0.0))
+    pilot = FlockPilot(changed(ALONE.drone, mission=mission, perception__height="best"), NEVER_ASKED)
+
+    def ground(north: FloatArray, _: FloatArray) -> FloatArray:
+        return np.maximum((north - 6.0) * slope, 0.0)
+
+    start, sensors = StartConfig(position_m=(0.0, 0.0, -2.0), velocity_m_s=(speed_m_s, 0.0)), SensorConfig()
+    flown = Vehicles([start], VehicleConfig(), sensors=sensors)
+    autopilot = SimulatedAutopilot(sensors, seed=0, drone=0, ground=ground)
+    commands, above_m, height_m = list[Wanted](), list[float](), 2.0
+    for time_s in np.arange(0.0, 20.0, STEP_S).tolist():
+        moving = flown.position[0], flown.velocity[0], flown.R_ned_body[0]
+        state = autopilot.read(time_s, *moving, errors=flown.errors[0])
+        commands.append(pilot.step(frames(time_s), state).command)
+        for command in (commands[-2:][0], commands[-1]):  # half a step after the images
+            height_m = command.height_m if climbs and command.height_m is not None else height_m
+            flown.step(command.velocity[None], np.zeros(1), STEP_S / 2, np.array([height_m]))
+            above_m.append(-flown.position[0, 2] - float(ground(*flown.position[0, :2])))
+    assert min(above_m) >= least_m
+    for lost in (replace(state, height_m=math.nan), replace(state, ground_range=None)):  # not down into the hill
+        kept_m = pilot.step(frames(lost.time_s), lost).command.height_m
+        assert kept_m is not None and kept_m > 3.0
 
 
 def test_input_that_cannot_be_is_refused_and_the_next_step_is_as_if_it_had_not_come(flyer: Flyer) -> None:

@@ -134,26 +134,6 @@ def test_a_range_gives_the_scale_of_a_step(hilly: Flyer) -> None:
     assert not [reason for reason in output.reasons if reason.kind is ReasonKind.HEIGHT]
 
 
-def test_before_ground_that_rises_it_climbs() -> None:
-    """2 m above it, up a hill: at the height of the beginning less than 0.4 m is left after 15 s."""
-    low = Flyer(changed(scenario_with((25.0, 12.0, 0.0)), drone__perception__height="best", world__hills_m=5.0))
-    above_m = []
-    for _ in range(30):
-        frames, state = low.take_frames()
-        down = low.vehicles.R_ned_body[0][:, 2]
-        range_m = range_to_ground(low.vehicles.position[0], down, low.cameras.ground_height)
-        above_m.append(range_m * down[2])
-        output = low.pilot.step(frames, replace(state, ground_range=RangeReading(state.time_s, range_m)))
-        asked_m = output.command.height_m
-        low.vehicles.step(np.array([[-1.0, 0.0]]), np.zeros(1), STEP_S, np.array([0.0 if asked_m is None else asked_m]))
-        low.time_s, low.steps = low.time_s + STEP_S, low.steps + 1
-    assert min(above_m) >= 0.8 * low.scenario.drone.safety.gate.min_height_m
-    frames, state = low.take_frames()
-    for lost in (replace(state, height_m=math.nan), state):  # refused, and without a range: not down into the hill
-        asked = low.pilot.step(frames, lost).command.height_m
-        assert asked is not None and asked_m is not None and asked >= asked_m
-
-
 def test_without_a_range_there_is_no_scale_and_neighbours_are_seen_all_the_same(hilly: Flyer) -> None:
     hilly.pilot = FlockPilot(hilly.scenario.drone, hilly.truth)
     for _ in range(2):
