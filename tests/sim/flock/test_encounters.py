@@ -91,19 +91,23 @@ def test_among_mates_a_drone_steps_out_of_the_way_of_one_that_a_person_flies(num
 
 @pytest.mark.fault("one-that-does-not-avoid")
 @pytest.mark.parametrize("speed_m_s", [1.0, 2.0])
-@pytest.mark.parametrize("trapped", ["between two", "beside the fence"])
+@pytest.mark.parametrize("trapped", ["between two", "beside the fence", "near the fence"])
 def test_where_the_usual_side_is_taken_a_drone_leaves_to_the_other(trapped: str, speed_m_s: float) -> None:
-    """People fly at one that hovers, from both sides, or along a fence that is 0.8 m to its right."""
+    """People fly at one that hovers, from both sides, or along a fence that is 0.8 m to its right. Or at one that flies
+    1.4 m from the fence, where it has room for a second."""
 
-    def comes(way: float) -> StartConfig:
-        mission = MissionParameters(kind="velocity", velocity_m_s=(-way * speed_m_s, 0.0))
-        velocity = mission.velocity_m_s or (0.0, 0.0)
-        return StartConfig(position_m=(12.0 * way, 0.05, -5.0), velocity_m_s=velocity, mission=mission, by_hand=True)
+    def comes(way: float, *, by_hand: bool = True) -> StartConfig:
+        velocity = (-way * speed_m_s, 0.0)
+        mission = MissionParameters(kind="velocity", velocity_m_s=velocity)
+        place = (12.0 * way, 0.05, -5.0) if by_hand else (0.0, 0.0, -5.0)
+        return StartConfig(position_m=place, velocity_m_s=velocity, mission=mission, by_hand=by_hand)
 
     hovers = StartConfig(position_m=(0.0, 0.0, -5.0), mission=MissionParameters(kind="hover"))
+    own = comes(-1.0, by_hand=False) if trapped == "near the fence" else hovers
     others = [comes(1.0), comes(-1.0)] if trapped == "between two" else [comes(1.0)]
-    corners = ((-60.0, -60.0), (-60.0, 0.8), (60.0, 0.8), (60.0, -60.0))
+    side_m = 1.4 if trapped == "near the fence" else 0.8
+    corners = ((-60.0, -60.0), (-60.0, side_m), (60.0, side_m), (60.0, -60.0))
     fence = {} if trapped == "between two" else {"drone__safety__gate__fence_corners_m": corners}
-    flight = changed(ENCOUNTER, vehicles=(hovers, *others), duration_s=12.0 / speed_m_s + 4.0, **fence)
+    flight = changed(ENCOUNTER, vehicles=(own, *others), duration_s=12.0 / speed_m_s + 4.0, **fence)
     places = fly_exact_states(changed(flight, detections__missed=0.05))[1]
-    assert closest_distances(places)[:, 0, 1:].min() >= 0.8
+    assert closest_distances(places)[:, 0, 1:].min() >= (1.0 if trapped == "near the fence" else 0.8)
