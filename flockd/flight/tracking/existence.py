@@ -17,11 +17,14 @@ _SUREST = 0.999
 """Limit of a network's probability of a drone, and of its complement."""
 
 
-def begun(drone_probability: float, parameters: TrackingParameters) -> float:
-    """The probability for a new track from one detection. Among doubtful detections clutter is denser by the ratio of
-    the odds that confirm a track to theirs."""
+def begun(drone_probability: float, share: float, parameters: TrackingParameters) -> float:
+    """The probability for a new track from one detection.
+
+    Among doubtful detections clutter is denser by the ratio of the odds that confirm a track to theirs; among vague
+    ones by the ratio of their range sigma to that of drones, 1 / ``share``.
+    """
     doubt = _log_odds(drone_probability) - _log_odds(parameters.confirm_probability)
-    return _bayes(parameters.birth_probability, min(doubt, 0.0))
+    return _bayes(parameters.birth_probability, min(doubt, 0.0) + math.log(share))
 
 
 def missed(probability: float, in_view: float, weight: float, parameters: TrackingParameters) -> float:
@@ -29,10 +32,19 @@ def missed(probability: float, in_view: float, weight: float, parameters: Tracki
     return _bayes(probability, weight * math.log(1.0 - in_view * parameters.detection_probability))
 
 
-def detected(probability: float, log_likelihood: float, weight: float, parameters: TrackingParameters) -> float:
-    """After a detection was assigned to the track: ``log_likelihood`` is compared with the density of clutter."""
+def detected(
+    probability: float, log_likelihood: float, weight: float, parameters: TrackingParameters, persists: float = 0.0
+) -> float:
+    """After a detection was assigned to the track: ``log_likelihood`` is compared with the density of clutter.
+
+    A shadow or a bush is detected again where it was: with the probability ``persists`` clutter is where the track is
+    expected.
+    """
     chance = parameters.detection_probability
-    log_ratio = np.logaddexp(math.log(1.0 - chance), math.log(chance / parameters.clutter_density) + log_likelihood)
+    clutter = math.log(parameters.clutter_density)
+    if persists > 0.0:
+        clutter = np.logaddexp(clutter, math.log(persists) + log_likelihood)
+    log_ratio = np.logaddexp(math.log(1.0 - chance), math.log(chance) + log_likelihood - clutter)
     return _bayes(probability, weight * float(log_ratio))
 
 

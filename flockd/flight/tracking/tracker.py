@@ -195,10 +195,12 @@ class Tracker:
         interval_s = max(0.0, self._time_s - track.last_seen_s)
         track.hits += 1
         track.agrees = bool(squared_distance <= self.parameters.confirm_sigma**2)
-        track.agreed += weight * track.agrees * self._share(measurement)
+        before, track.share = track.share, self._share(measurement)
+        track.agreed += weight * track.agrees * track.share
         if track.confirmed:
             self._remember(measurement, weight)
-        track.existence = existence.detected(track.existence, log_likelihood, weight, self.parameters)
+        persists = (1.0 - before) * (1.0 - track.share)  # false ones are vague, this one and the last
+        track.existence = existence.detected(track.existence, log_likelihood, weight, self.parameters, persists)
         track.drone_probability = existence.averaged(
             track.drone_probability, measurement.drone_probability, track.hits, interval_s, self.parameters
         )
@@ -232,13 +234,15 @@ class Tracker:
 
     def _begin(self, measurement: Measurement) -> _Track:
         self._created += 1
+        share = self._share(measurement)
         return _Track(
             number=self._created,
-            existence=existence.begun(measurement.drone_probability, self.parameters),
+            existence=existence.begun(measurement.drone_probability, share, self.parameters),
             drone_probability=measurement.drone_probability,
             first_seen_s=self._time_s,
             last_seen_s=self._time_s,
-            agreed=self._share(measurement),
+            share=share,
+            agreed=share,
         )
 
     def _confirm(self, track: _Track) -> None:
@@ -251,7 +255,8 @@ class Tracker:
     def _is_kept(self, track: _Track) -> bool:
         known_s = track.last_seen_s - track.first_seen_s
         longest_s = max(self.parameters.max_unseen_s, _UNSEEN_SHARE * known_s)
-        return track.missing_s <= longest_s + JITTER_S and track.existence >= self.parameters.drop_probability
+        least = self.parameters.drop_probability * track.share  # the next detections of one that is only vague tell
+        return track.missing_s <= longest_s + JITTER_S and track.existence >= least
 
 
 def _probability_in_view(mean: FloatArray, covariance: FloatArray, shown: Shown) -> float:
@@ -277,6 +282,8 @@ class _Track:
     """Probability that it is a drone if it exists."""
     first_seen_s: float
     last_seen_s: float
+    share: float
+    """Evidence of the newest detection, 0 to 1."""
     agreed: float
     """Sum of the evidence of hits within `confirm_sigma`: independent and precise ones count 1."""
     hits: int = 1

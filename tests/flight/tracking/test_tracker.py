@@ -146,6 +146,18 @@ def test_a_doubtful_detection_begins_a_less_likely_track(probability: float, exi
     assert flock.one.existence_probability == pytest.approx(existence * probability)
 
 
+def test_beside_well_known_drones_a_vague_detection_is_less_likely_a_drone_and_slows_less() -> None:
+    """By hand: a range sigma of 20 % is 8 times twice the usual 1.25 %, so the odds of existence begin at an eighth. A
+    shadow is detected again and again, as a drone is, and is not confirmed for it."""
+    mate, vague = _seen(5.0 * EAST, 0.0625), _seen(AHEAD, 0.8)
+    alone, beside = Follower().steps(1, vague), Follower().steps(10, mate).steps(1, mate, vague)
+    assert [flock.all[-1].existence_probability for flock in (alone, beside)] == pytest.approx([1 / 2, 1 / 9], rel=1e-3)
+    assert beside.fastest() > alone.fastest()
+    alone.steps(20, vague)
+    beside.steps(20, mate, vague)
+    assert [len(flock.confirmed) for flock in (alone, beside)] == [1, 1]
+
+
 def test_existence_after_a_miss_is_bayes_rule() -> None:
     """By hand: P_D = 0.75, survival 0.5 s of 10 s: p = e^-0.05; missed: p / 4 / (1 - p + p / 4)."""
     flock = Follower(detection_probability=0.75, survival_time_s=10.0).steps(20, AHEAD).steps(1)
