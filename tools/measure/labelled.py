@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -46,18 +46,36 @@ def read_labels(path: Path) -> dict[Path, list[Box]]:
             told = f"is of {here[0]:g} x {here[1]:g} pixels, upright, and its labels of {said[0]} x {said[1]}"
             raise SystemExit(f"{path}: {one['file_name']} {told}; label the pictures that are here")
     found: dict[Path, list[Box]] = {file: [] for file in files.values()}
+    known = {one["id"] for one in coco["categories"]}
     for one in coco["annotations"]:
+        if one["category_id"] not in known or one["image_id"] not in files:
+            raise SystemExit(f"{path}: {_told_of(one)}: its category or image is not listed; correct the ids")
         if one["category_id"] not in drones or one.get("iscrowd"):
             continue
-        left, top, width, height = one["bbox"]
+        left, top, width, height = _numbers(path, one)
         wide, high = sizes[one["image_id"]]
         fault = f"{path}: image {one['image_id']}: bbox {one['bbox']} in {wide:g} x {high:g} pixels"
         if max(one["bbox"]) <= 1:
             raise SystemExit(f"{fault} is in shares of it; write pixels: left, top, width, height")
         if not (-1 <= left < left + width <= wide + 1 and -1 <= top < top + height <= high + 1):
             raise SystemExit(f"{fault} ends outside it; write left, top, width, height, not the corners")
-        found[files[one["image_id"]]].append((left, top, left + width, top + height))
+        box = (left, top, left + width, top + height)
+        if box in found[files[one["image_id"]]]:
+            raise SystemExit(f"{path}: {_told_of(one)} is there twice; delete one")
+        found[files[one["image_id"]]].append(box)
     return found
+
+
+def _told_of(annotation: Mapping[str, Any]) -> str:
+    return f"image {annotation['image_id']}: bbox {annotation.get('bbox')} of category {annotation['category_id']!r}"
+
+
+def _numbers(path: Path, annotation: Mapping[str, Any]) -> Box:
+    """Left, top, width and height. Raises SystemExit for what is no four numbers."""
+    box = annotation.get("bbox")
+    if not isinstance(box, list) or len(box) != 4 or not all(isinstance(one, int | float) for one in box):
+        raise SystemExit(f"{path}: {_told_of(annotation)} is no box; write left, top, width, height in pixels")
+    return box[0], box[1], box[2], box[3]
 
 
 def _size(file: Path) -> tuple[float, float]:
@@ -78,10 +96,10 @@ def scored(pictures: Sequence[dict[str, Any]], labels: dict[Path, list[Box]]) ->
     precision at an intersection over union of 0.5; ``measured`` pictures; ``false``: detections that found no box.
     """
     counts = {name: {"boxes": 0, "found": 0} for name in WIDTH_CLASSES}
-    measured, false, judged = 0, 0, list[tuple[float, bool]]()
+    measured, false, judged, left = 0, 0, list[tuple[float, bool]](), dict(labels)
     for picture in pictures:
-        if (boxes := labels.get(Path(picture["file"]).resolve())) is None:
-            continue
+        if (boxes := left.pop(Path(picture["file"]).resolve(), None)) is None:
+            continue  # without labels, or once more
         measured += 1
         detections = sorted(picture["detections"], key=lambda one: -one["probability"])
         found = match([tuple(one["box"]) for one in detections], boxes, middle_inside)
@@ -153,8 +171,11 @@ def _told(path: Path, read: Callable[[], Any], wanted: str) -> Any:
         return read()
     except OSError as error:
         raise SystemExit(f"{path}: cannot be read ({error.strerror}); name another file") from None
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise SystemExit(f"{path}: lacks or garbles {error}; give {wanted}") from None
+    except KeyError as error:
+        raise SystemExit(f"{path}: lacks {error}; give {wanted}") from None
+    except (ValueError, IndexError, TypeError, AttributeError) as error:
+        fault = "is no JSON" if isinstance(error, ValueError) else "is of another form"
+        raise SystemExit(f"{path}: {fault}; give {wanted}") from None
 
 
 def main() -> None:
@@ -164,7 +185,8 @@ def main() -> None:
     parser.add_argument("labels", type=Path, help="boxes in COCO's format")
     args = parser.parse_args()
     detected = _told(args.found, lambda: _json(args.found)["pictures"], "what `flockd detect --json` printed")
-    found = scored(detected, _told(args.labels, lambda: read_labels(args.labels), "boxes in COCO's format"))
+    labels = _told(args.labels, lambda: read_labels(args.labels), "boxes in COCO's format")
+    found = _told(args.found, lambda: scored(detected, labels), "what `flockd detect --json` printed")
     if not found["measured"]:
         raise SystemExit(f"{args.found}: has none of the pictures of {args.labels}; detect in the folder of the labels")
     print(json.dumps(found, indent=1))

@@ -133,7 +133,9 @@ def _of_colmap(words: list[str]) -> ForeignLens:
 
 def _of_kalibr(name: str, values: Mapping[str, Any]) -> ForeignLens:
     camera, numbers = values["camera_model"], list(values["intrinsics"])
-    model, distortion = values.get("distortion_model", "none"), values.get("distortion_coeffs", ())
+    model, distortion = values.get("distortion_model", "none"), values.get("distortion_coeffs")
+    if distortion is None and model != "none":
+        raise ValueError(f"distortion_coeffs of {name}, for its {model}")
     if camera not in _KALIBR:
         return _lens(name, values["resolution"], camera, camera, (1, 1, 0, 0), ())
     names = _KALIBR[camera].split()
@@ -142,7 +144,7 @@ def _of_kalibr(name: str, values: Mapping[str, Any]) -> ForeignLens:
     found = dict(zip(names, numbers, strict=False))
     mirror = (found.get("xi", 0.0), found.get("alpha", 0.0), found.get("beta", 1.0))
     label = f"{camera}-{model}"
-    return _lens(name, values["resolution"], label, model, (*numbers[-4:], *mirror), distortion, CENTRE_PX)
+    return _lens(name, values["resolution"], label, model, (*numbers[-4:], *mirror), distortion or (), CENTRE_PX)
 
 
 def _of_matrices(values: Mapping[str, Any], name: str, size: tuple[int, int] | None) -> ForeignLens:
@@ -151,7 +153,12 @@ def _of_matrices(values: Mapping[str, Any], name: str, size: tuple[int, int] | N
     if matrix.size != 9 or not matrix.any():
         raise ValueError(f"the camera_matrix, {matrix.size} numbers{'' if matrix.any() else ' that are 0'}")
     matrix = matrix.reshape(3, 3)
-    distortion = _data(values.get("distortion_coefficients", ()))
+    if "distortion_coefficients" not in values:
+        raise ValueError("the distortion, as distortion_coefficients or D; zeros if there is none")
+    distortion = _data(values["distortion_coefficients"])
+    roi = values.get("roi") or {}
+    if max(values.get("binning_x", 0), values.get("binning_y", 0)) > 1 or any(roi.get(key) for key in _OFFSETS):
+        raise ValueError("a lens of whole images, as it is of a part of them (roi) or of summed pixels (binning)")
     if "image_width" in values:
         size = values["image_width"], values["image_height"]
     if size is None:
@@ -164,6 +171,7 @@ def _of_matrices(values: Mapping[str, Any], name: str, size: tuple[int, int] | N
     return _lens(name, size, label, model, numbers, distortion, CENTRE_PX, float(matrix[0, 1]))
 
 
+_OFFSETS = ("x_offset", "y_offset")
 _NAMES: Mapping[str, tuple[str, ...]] = {
     "camera_matrix": ("camera_matrix", "Camera_Matrix", "cameraMatrix", "K", "M1"),
     "distortion_coefficients": ("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "D", "D1"),
@@ -172,6 +180,8 @@ _NAMES: Mapping[str, tuple[str, ...]] = {
     "xi": ("xi",),
 }
 """What OpenCV's programs and tutorials call them."""
+_OF_EITHER = 4
+"""Coefficients that `cv2.calibrateCamera` may give, and `cv2.fisheye.calibrate` always gives."""
 _ECHOED = {"k": "camera_matrix", "d": "distortion_coefficients", "width": "image_width", "height": "image_height"}
 """As `ros2 topic echo` and `rostopic echo` print a CameraInfo."""
 
@@ -198,7 +208,14 @@ def _stored(storage: cv2.FileStorage, known: Mapping[str, tuple[str, ...]]) -> d
             found[key] = node.real() if node.isReal() else float(node.mat()[0, 0])
         else:
             found[key] = int(node.real()) if key.startswith("image") else {"data": node.mat().ravel().tolist()}
-    if not storage.getNode("fisheye_model").empty() and storage.getNode("fisheye_model").real():
+    fisheye = storage.getNode("fisheye_model")
+    if (
+        fisheye.empty()
+        and "xi" not in found
+        and len(found.get("distortion_coefficients", {"data": ()})["data"]) == _OF_EITHER
+    ):
+        raise ValueError("fisheye_model, 0 or 1: of 4 coefficients a pinhole and a fisheye have other meanings")
+    if not fisheye.empty() and fisheye.real():
         found["distortion_model"] = "equidistant"
     return found
 

@@ -87,7 +87,7 @@ def stored(file: Path, **values: Any) -> Path:
     """As OpenCV's programs write it."""
     storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
     for name, value in values.items():
-        storage.write(name, np.array(value))
+        storage.write(name, value if isinstance(value, int) else np.array(value))
     storage.release()
     return file
 
@@ -124,9 +124,26 @@ def test_what_opencv_stores_is_read_under_its_names_and_needs_a_size(tmp_path: P
 
 
 def test_both_cameras_of_opencvs_stereo_calibration_are_read(tmp_path: Path, imported: Imported) -> None:
-    imported(0, stored(tmp_path / "pair.yml", M1=K, D1=PINHOLE, M2=K, D2=PINHOLE[:4]), "--size", "640x480")
+    imported(0, stored(tmp_path / "pair.yml", M1=K, D1=PINHOLE, M2=K, D2=PINHOLE), "--size", "640x480")
     found = {camera.name: camera.intrinsics.distortion for camera in load_drone(tmp_path / "ours.yaml").rig.cameras}
-    assert found == {"pair1": tuple(PINHOLE), "pair2": tuple(PINHOLE[:4])}
+    assert found == {"pair1": tuple(PINHOLE), "pair2": tuple(PINHOLE)}
+
+
+def test_four_coefficients_of_opencv_are_of_the_lens_that_the_file_names(tmp_path: Path, imported: Imported) -> None:
+    size = ("--size", "640x480")
+    assert "lacks or garbles fisheye_model, 0 or 1: of 4" in imported(
+        1, stored(tmp_path / "a.yml", K=K, D=FISHEYE), *size
+    )
+    for fisheye, model in enumerate(("pinhole", "wide_angle")):
+        file = stored(tmp_path / f"{model}.yml", K=K, D=FISHEYE, fisheye_model=fisheye)
+        imported(0, file, *size, "--force")
+        (camera,) = load_drone(tmp_path / "ours.yaml").rig.cameras
+        assert camera.intrinsics.model == model
+
+
+def test_a_distortion_under_an_unknown_name_is_not_taken_for_none(tmp_path: Path, imported: Imported) -> None:
+    file = stored(tmp_path / "lens.yml", camera_matrix=K, dist_coeffs=PINHOLE)
+    assert "lacks or garbles the distortion, as distortion_coefficients or D" in imported(1, file, "--size", "640x480")
 
 
 def test_another_size_than_the_files_is_refused(imported: Imported) -> None:
@@ -286,6 +303,16 @@ def test_a_lens_without_an_equal_is_refused_with_how_far_the_nearest_is_off(
         ("camera_matrix: {data: [1, 2]}\n", "lacks or garbles the camera_matrix, 2 numbers; give Kalibr's camchain"),
         (f"camera_matrix: {{data: {[0] * 9}}}\n", "the camera_matrix, 9 numbers that are 0; give Kalibr's camchain"),
         ("[\n", "cannot be read ("),
+        (
+            ROS.replace("distortion_coefficients", "dist").replace("COEFFICIENTS", "[0]"),
+            "lacks or garbles the distortion",
+        ),
+        (
+            _filled(KALIBR, [0.1], MODEL="radtan", CAMERA="pinhole").replace("_coeffs", ""),
+            "distortion_coeffs of cam0, for",
+        ),
+        (_filled(ROS, PINHOLE, MODEL="plumb_bob") + "roi: {x_offset: 9}\n", "lens of whole images, as it is of a part"),
+        (_filled(ROS, PINHOLE, MODEL="plumb_bob") + "binning_x: 2\n", "a lens of whole images"),
         ("%YAML:1.0\n---\nK: 3\n", "OpenCV cannot read it; write it again"),
     ],
 )

@@ -68,12 +68,28 @@ def test_pictures_with_and_without_drones_and_one_without_labels(tmp_path: Path)
 NO_PICTURES = '{"categories": [{"id": 1, "name": "drone"}], "images": [], "annotations": []}'
 
 
+ONE_BOX = '{"image_id": 1, "category_id": 1, "bbox": [1, 1, 9, 9]}'
+A_BOX = NO_PICTURES.replace('"images": []', '"images": [{"id": 1, "file_name": "a.png"}]').replace(
+    '"annotations": []', f'"annotations": [{ONE_BOX}]'
+)
+
+
 @pytest.mark.parametrize(
     ("found", "labels", "told"),
     [
-        ('{"pictures": []}', "{}", "labels.json: lacks or garbles 'categories'; give boxes in COCO's format"),
-        ("[]", NO_PICTURES, "found.json: lacks or garbles "),
-        ("pictures", NO_PICTURES, "found.json: lacks or garbles "),
+        ('{"pictures": []}', "{}", "labels.json: lacks 'categories'; give boxes in COCO's format"),
+        ("[]", NO_PICTURES, "found.json: is of another form; give what"),
+        ("pictures", NO_PICTURES, "found.json: is no JSON; give what"),
+        ('{"pictures": [{"file": "FOLDER/a.png"}]}', A_BOX, "found.json: lacks 'detections'; give what"),
+        ('{"pictures": []}', "0 0.5 0.5 0.1 0.1", "labels.json: is no JSON; give boxes in COCO's format"),
+        (
+            '{"pictures": []}',
+            A_BOX.replace('ry_id": 1', 'ry_id": 0'),
+            "of category 0: its category or image is not listed",
+        ),
+        ('{"pictures": []}', A_BOX.replace('ge_id": 1', 'ge_id": 2'), "image 2: .*its category or image is not listed"),
+        ('{"pictures": []}', A_BOX.replace(", 9]", "]"), "of category 1 is no box; write left, top, width, height"),
+        ('{"pictures": []}', A_BOX.replace(ONE_BOX, f"{ONE_BOX}, {ONE_BOX}"), "is there twice; delete one"),
         ('{"pictures": []}', NO_PICTURES, "found.json: has none of the pictures of "),
     ],
 )
@@ -82,7 +98,7 @@ def test_what_cannot_be_measured_is_told_in_a_sentence(
 ) -> None:
     files = [tmp_path / "found.json", tmp_path / "labels.json"]
     for file, text in zip(files, (found, labels), strict=True):
-        file.write_text(text, encoding="utf-8")
+        file.write_text(text.replace("FOLDER", str(tmp_path)), encoding="utf-8")
     monkeypatch.setattr("sys.argv", ["labelled", *map(str, files)])
     with pytest.raises(SystemExit, match=told):
         main()
