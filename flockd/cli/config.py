@@ -138,6 +138,7 @@ def _check_file(file: Path, *, force: bool) -> None:
         problems += [*_yet_to_fill_in(config, places), *_settings_of_zenoh(config, places)]
     if problems:
         raise ConfigError(problems)
+    _warn_of_idle_keys(config.drone if isinstance(config, ScenarioConfig) else config, section[:-1], places)
     if isinstance(config, ScenarioConfig):
         for sentence in config.warnings():
             complain(f"warning: {file}: {sentence}")
@@ -151,6 +152,13 @@ def _check_file(file: Path, *, force: bool) -> None:
             one for one in (*uncalibrated(config), coverage(config.rig), *lenses) if one.level is not Level.PASS
         ):
             complain(f"warning: {file}: {finding.about}: {finding.measured}; {finding.fix}")
+
+
+def _warn_of_idle_keys(config: DroneConfig, section: KeyPath, places: Mapping[KeyPath, Place]) -> None:
+    """``section``: of the drone in the file."""
+    for key, why in config.idle_keys().items():
+        if (place := places.get((*section, *key))) is not None:
+            complain(f"warning: {place.problem(f'has no effect, as {why}; delete it, or change that')}")
 
 
 def _yet_to_fill_in(config: DroneConfig, places: Mapping[KeyPath, Place]) -> list[ConfigProblem]:

@@ -143,6 +143,17 @@ class DroneConfig(Section):
         refuse(self, faults)
         return self
 
+    def idle_keys(self) -> dict[tuple[str, ...], str]:
+        """Keys without an effect, as another key has this value, and why."""
+        kind = "shared_memory" if self.source is None else self.source.kind
+        idle = {
+            ("recording", "jpeg_quality"): ("recording.images is png", self.recording.images == "png"),
+            ("perception", "drone_size_sigma_m"): ("there is no drone_size_m", self.perception.drone_size_m is None),
+            ("source", "shared_memory"): (f"source.kind is {kind}", kind != "shared_memory"),
+            ("autopilot", "max_velocity_trim_m_s"): ("own_velocity is autopilot", self.own_velocity == "autopilot"),
+        }
+        return {key: why for key, (why, is_idle) in idle.items() if is_idle}
+
     def _late_steps(self) -> dict[tuple[str | int, ...], str]:
         """Faults of a `step_s` so long that each step, or one that is late, would stop the drone."""
         fresh_s, lasts_s = self.safety.gate.command_fresh_s, self.safety.estimate_timeout_s

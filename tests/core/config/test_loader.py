@@ -496,6 +496,19 @@ def test_a_calibration_that_cannot_be_true_is_refused(
     assert (error["loc"], told in error["msg"]) == (("intrinsics", key), True)
 
 
+def test_keys_without_an_effect_are_told_by_config_check(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "drone.yaml"
+    idle = "recording: {jpeg_quality: 50}\nperception: {drone_size_sigma_m: 0.1}\n"
+    path.write_text(DRONE + idle, encoding="utf-8")
+    assert main(["config", "check", str(path)]) == 0
+    told = capsys.readouterr().err
+    assert ": recording.jpeg_quality: has no effect, as recording.images is png; delete it, or change that\n" in told
+    assert ": perception.drone_size_sigma_m: has no effect, as there is no drone_size_m; " in told
+    path.write_text(DRONE + idle.replace("{", "{images: jpeg, ", 1).replace("{dr", "{drone_size_m: 0.4, dr"), "utf-8")
+    assert main(["config", "check", str(path)]) == 0
+    assert "has no effect" not in capsys.readouterr().err
+
+
 def test_a_view_that_no_network_was_trained_on_is_told_by_config_check(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
