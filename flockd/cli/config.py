@@ -163,7 +163,7 @@ def _warn_of_idle_keys(config: DroneConfig, section: KeyPath, places: Mapping[Ke
 
 def _yet_to_fill_in(config: DroneConfig, places: Mapping[KeyPath, Place]) -> list[ConfigProblem]:
     """The devices that `flockd config new drone` could not know."""
-    fault = f"is yet to be filled in ({CHANGE_ME}); `flockd cameras --write FILE` writes what is plugged in"
+    fault = f"is yet to be filled in ({CHANGE_ME}); `flockd cameras --write FILE` writes the cameras that it finds"
     cameras = () if config.source is None else config.source.cameras
     return [
         places["source", "cameras", number, "device"].problem(fault)

@@ -55,3 +55,16 @@ def test_a_table_says_median_and_worst_beside_the_exact_and_the_blind() -> None:
     assert rows[0] == "| square: 3 flights of 30 s | sight | 0.9 (0.8) |"
     assert rows[1:] == ["|  | blind | 0.5 (0.4) |", "|  | exact | 0.99 (0.89) |"]
     assert "| by sight | time from which the shape stays, s |\n| --- | --- |\n| square | 70 in 1 of 3 |" in page
+
+
+def test_of_each_flight_the_one_with_the_lowest_order_is_told() -> None:
+    each = [
+        {"seed": seed, "order_tail": order, "shape_deviation_tail": shape, "min_distance_after_10s_m": 1.5,
+         "slowed_share": 0.2}
+        for seed, order, shape in ((3, 0.99, 40.0), (7, 0.5, 20.0))
+    ]  # fmt: skip
+    origin = {"commit": "0" * 40, "date": "2026-11-28", "command": "python -m nothing", "machine": "none"}
+    part = {"the paper's five drones": {**origin, "sight": {"each": each}}}
+    page = written("<!-- figures: each -->\n<!-- end of figures -->", {"flights": part})
+    assert page.splitlines()[3].startswith("| 3 |"), "the largest shape deviation first"
+    assert "Lowest order: seed 7, 0.5. From 10 s on no two of its drones came nearer than 1.5 m; gates" in page

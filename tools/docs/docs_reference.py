@@ -58,10 +58,7 @@ def refusals_page() -> str:
         whats, names = rows.setdefault(reason.remedy, ([], []))
         whats.append(reason.what)
         names.append(f"`{name}`")
-    texts = {
-        remedy: "; ".join(dict.fromkeys(whats)).replace("` fails; its check `", "`, `")
-        for remedy, (whats, _) in rows.items()
-    }
+    texts = {r: "; ".join(dict.fromkeys(w)).replace("` fails; its check `", "`, `") for r, (w, _) in rows.items()}
     return _page(
         "Why the autopilot refuses",
         "Every reason that flockd knows for which an autopilot refuses to arm or to fly offboard, and what to do, in",

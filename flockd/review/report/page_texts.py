@@ -118,9 +118,7 @@ def facts(summary: Summary, log: FlightLog) -> Iterator[dict[str, str]]:
     if summary["drones"] > 1 and summary["has_truth"]:
         yield _fact("Closest two drones", flock["min_distance_m"], 2, f"in 3D, {_closest(log)}", "m")
         hovers = flock["order_tail"] is None
-        yield _fact(
-            "Order", flock["order_tail"], 3, "the flock hovers" if hovers else "1: all fly in the same direction"
-        )
+        yield _fact("Order", flock["order_tail"], 3, "the flock hovers" if hovers else "1: all fly in one direction")
         yield _fact("Union", flock["union_tail"], 2, "1: the flock is connected")
     if summary["has_truth"]:
         heights = -log.position[..., 2]

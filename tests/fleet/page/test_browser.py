@@ -233,6 +233,8 @@ def test_by_sight_the_page_shows_what_a_drone_sees_beside_the_map(flock: Flock) 
 def fly_by_hand(page: Page) -> None:
     """What a person does with the controls, one after the other."""
     simulation, answers = page.locator("#simulation"), page.locator("#answers")
+    page.locator("#curves select").select_option("battery")
+    expect(page.locator("#curves")).to_contain_text("No drone has sent this yet.")
     page.locator("#map [name=goal]").check()
     page.locator("#map canvas").click(position={"x": 60, "y": 60})
     expect(page.locator("#confirm h2")).to_have_text("Send 3 drones to a place?")
