@@ -1,9 +1,8 @@
 """Camera models, rigid fits, Algorithm 1, ego- and neighbour motion. Pure and deterministic: no clock, no files."""
 
 from flockd.flight.geometry.cameras import Camera, PinholeCamera, WideAngleCamera
-from flockd.flight.geometry.depth_maps import RangeMap, ZMap, range_map
+from flockd.flight.geometry.depth_maps import RangeMap, ZMap, ground_inverse_depth, range_map
 from flockd.flight.geometry.ego_motion import estimate_ego_motion, moved_pixels
-from flockd.flight.geometry.ground import ground_inverse_depth
 from flockd.flight.geometry.pairs import PointPairs, grid_pixels, lift_matches
 from flockd.flight.geometry.polar import log_polar, log_polar_covariance, log_polar_residual
 from flockd.flight.geometry.rig import R_FRD_RDF, Rig, RigCamera, build_rig

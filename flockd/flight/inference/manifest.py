@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Literal
 
 import numpy as np
@@ -15,14 +14,8 @@ from flockd.core.errors import ModelError
 from flockd.core.messages import Float32Array, FloatArray
 
 Key = tuple[str | int, ...]
-
-
-@dataclass(frozen=True)
-class Fault:
-    """A fault of a manifest: its key, and a sentence that says what is wrong and what to do."""
-
-    key: Key
-    message: str
+Fault = tuple[Key, str]
+"""A fault of a manifest: its key, and a sentence that says what is wrong and what to do."""
 
 
 class TensorSpec(Section):
@@ -58,24 +51,24 @@ class InputSpec(TensorSpec):
         """Why no image can be converted to this input."""
         if len(self.shape) != 4:
             wanted = self.layout if self.kind == "image" else "nchw"
-            yield Fault(("shape",), f"has {len(self.shape)} axes; write the 4 of {wanted}")
+            yield ("shape",), f"has {len(self.shape)} axes; write the 4 of {wanted}"
             return
         if self.kind == "planes":
             if not isinstance(self.shape[1], int):
-                yield Fault(("shape", 1), f"{self.shape[1]} is not fixed; write how many planes there are")
+                yield ("shape", 1), f"{self.shape[1]} is not fixed; write how many planes there are"
             if self.dtype == "uint8":
-                yield Fault(("dtype",), "uint8 is for images; write float32 or float16 for planes")
+                yield ("dtype",), "uint8 is for images; write float32 or float16 for planes"
             return
         channels = 1 if self.colour == "grey" else 3
         axis = 3 if self.layout == "nhwc" else 1
         if self.shape[axis] != channels:
             message = f"{self.shape[axis]} is not the {channels} of a {self.colour} image in {self.layout}"
-            yield Fault(("shape", axis), f"{message}; correct the shape, the colour or the layout")
+            yield ("shape", axis), f"{message}; correct the shape, the colour or the layout"
         for key, values in (("mean", self.mean), ("deviation", self.deviation)):
             if values and len(values) != channels:
-                yield Fault((key,), f"has {len(values)} numbers for {channels} channels; write one for each channel")
+                yield (key,), f"has {len(values)} numbers for {channels} channels; write one for each channel"
         if self.dtype == "uint8" and (self.mean or self.deviation or self.white != 255.0):
-            yield Fault(("dtype",), "uint8 takes grey levels as they are; delete white, mean and deviation")
+            yield ("dtype",), "uint8 takes grey levels as they are; delete white, mean and deviation"
 
 
 class DepthMeaning(Section):
@@ -112,11 +105,10 @@ class OutputSpec(TensorSpec):
         """Why the columns are impossible."""
         if not self.columns:
             return
-        if (doubled := _doubled(self.columns)) is not None:
-            yield Fault(("columns",), f"names {doubled!r} twice; give each column its own name")
-        if len(self.shape) != 2 or self.shape[1] != len(self.columns):
-            message = f"has {len(self.columns)} names for the shape {listed(self.shape)}; name each column of (n, k)"
-            yield Fault(("columns",), message)
+        count = len(set(self.columns))
+        if len(self.shape) != 2 or not self.shape[1] == len(self.columns) == count:
+            message = f"has {count} different names for the shape {listed(self.shape)}; name each column of (n, k)"
+            yield ("columns",), message
 
 
 class CropSpec(Section):
@@ -216,27 +208,17 @@ class Manifest(Section):
         yield from _located(("outputs",), self.outputs)
         images = [spec for spec in self.inputs.values() if spec.kind == "image"]
         if not images:
-            yield Fault(("inputs",), "has no image; give one input `kind: image`")
-        for section, kind, names in (
-            ("inputs", "carries", [spec.carries or name for name, spec in self.inputs.items()]),
-            ("outputs", "gives", [spec.gives or name for name, spec in self.outputs.items()]),
-        ):
-            if (doubled := _doubled(names)) is not None:
-                yield Fault((section,), f"has two of which each {kind} {doubled!r}; correct `{kind}` of one")
+            yield ("inputs",), "has no image; give one input `kind: image`"
         if self.map_stride is None and len(images) < len(self.inputs):
-            yield Fault(("map_stride",), "is missing; write how many image pixels one number of the planes stands for")
+            yield ("map_stride",), "is missing; write how many image pixels one number of the planes stands for"
         if self.crop is not None and any(len(set(spec.image_size)) > 1 or not _is_fixed(spec) for spec in images):
-            yield Fault(("crop",), "is for models whose image input is square and of a fixed size; delete it")
+            yield ("crop",), "is for models whose image input is square and of a fixed size; delete it"
 
 
 def _located(section: Key, specs: Mapping[str, InputSpec] | Mapping[str, OutputSpec]) -> Iterator[Fault]:
     for name, spec in specs.items():
-        for fault in spec.faults():
-            yield Fault((*section, name, *fault.key), fault.message)
-
-
-def _doubled(names: Sequence[str]) -> str | None:
-    return next((name for name in names if names.count(name) > 1), None)
+        for key, message in spec.faults():
+            yield (*section, name, *key), message
 
 
 def _is_fixed(spec: InputSpec) -> bool:

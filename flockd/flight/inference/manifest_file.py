@@ -82,8 +82,8 @@ def read_manifest(path: Path) -> ManifestFile:
     if document.problems:
         raise ModelError(str(min(document.problems)))
     file = ManifestFile(path, manifest, document.places)
-    for fault in chain(manifest.faults(), check_roles(manifest)):
-        raise file.error(fault.key, fault.message)
+    for key, message in chain(manifest.faults(), check_roles(manifest)):
+        raise file.error(key, message)
     return file
 
 

@@ -88,7 +88,7 @@ REQUIREMENTS: Mapping[Role, Requirements] = {
 
 
 def check_roles(manifest: Manifest) -> Iterator[Fault]:
-    """Faults of a manifest: what its roles require and it lacks, and entries that no role knows."""
+    """Faults of a manifest: what its roles require and it lacks, and inputs that no role knows."""
     for role in manifest.roles:
         yield from _faults_of_tensors(manifest, role, REQUIREMENTS[role])
         yield from _faults_of_numbers(manifest, role, REQUIREMENTS[role])
@@ -99,17 +99,17 @@ def _faults_of_tensors(manifest: Manifest, role: Role, needed: Requirements) -> 
     for content in needed.inputs:
         if content not in manifest.contents:
             message = f"the role {role} needs one that carries {content!r}; name it so, or set its `carries`"
-            yield Fault(("inputs",), message)
+            yield ("inputs",), message
     names = {spec.gives or name: name for name, spec in manifest.outputs.items()}
     for result, columns in needed.outputs.items():
         if result not in names:
             message = f"the role {role} needs one that gives {result!r}; name it so, or set its `gives`"
-            yield Fault(("outputs",), message)
+            yield ("outputs",), message
             continue
         for column in columns:
             if column not in manifest.results[result].columns:
                 message = f"has no {column!r}; name the model's columns in their order, of which {role} needs "
-                yield Fault(("outputs", names[result], "columns"), message + ", ".join(columns))
+                yield ("outputs", names[result], "columns"), message + ", ".join(columns)
 
 
 def _faults_of_numbers(manifest: Manifest, role: Role, needed: Requirements) -> Iterator[Fault]:
@@ -117,27 +117,22 @@ def _faults_of_numbers(manifest: Manifest, role: Role, needed: Requirements) -> 
         value = manifest.thresholds.get(name)
         limits = f"a number from {low:g} to {high:g}"
         if value is None:
-            yield Fault(("thresholds", name), f"is missing for the role {role}; add it with {limits}")
+            yield ("thresholds", name), f"is missing for the role {role}; add it with {limits}"
         elif not low <= value <= high:
-            yield Fault(("thresholds", name), f"{value:g} is out of range; write {limits}")
+            yield ("thresholds", name), f"{value:g} is out of range; write {limits}"
     if needed.crop and manifest.crop is None:
-        yield Fault(("crop",), f"is missing for the role {role}; add a section that says how crops are cut out")
+        yield ("crop",), f"is missing for the role {role}; add a section that says how crops are cut out"
     if needed.map_stride and manifest.map_stride is None:
-        yield Fault(("map_stride",), f"is missing for the role {role}; write how many image pixels a map pixel spans")
+        yield ("map_stride",), f"is missing for the role {role}; write how many image pixels a map pixel spans"
 
 
 def _unknown_to_all(manifest: Manifest, known: list[Requirements]) -> Iterator[Fault]:
-    """Entries of the manifest that would not be used: most often a typing error."""
+    """Inputs that nothing would be fed to: most often a typing error."""
     inputs = {content for one in known for content in (*one.inputs, *one.optional_inputs)}
     for name, spec in manifest.inputs.items():
         content = spec.carries or name
         if content not in inputs:
             message = f"nothing is known to feed {content!r} with; set `carries` to one of {', '.join(sorted(inputs))}"
-            yield Fault(("inputs", name), message)
-        elif (spec.kind == "planes") != (content in _GEOMETRY):
-            yield Fault(("inputs", name, "kind"), f"has to be `{'planes' if content in _GEOMETRY else 'image'}` here")
-    names = [name for one in known for name in one.thresholds]
-    for name in manifest.thresholds:
-        if name not in names:
-            message = f"is not a threshold of its roles; delete it, or write one of {', '.join(names)}"
-            yield Fault(("thresholds", name), message if names else "is not a threshold of its roles; delete it")
+            yield ("inputs", name), message
+        elif spec.kind != (wanted := "planes" if content in _GEOMETRY else "image"):
+            yield ("inputs", name, "kind"), f"{spec.kind} does not fit {content!r}; write {wanted}"

@@ -69,17 +69,24 @@ class OnnxModel:
         file = read_manifest(path)
         file.check_model()
         self.manifest = file.manifest
-        self._refuse_provider(file, provider)
+        made_for = self.manifest.providers
+        if made_for and provider not in made_for:
+            raise file.error(
+                ("providers",),
+                f"{self.manifest.name} is made for {' and '.join(made_for)}, not for {provider}; name another model "
+                "(flockd's own without _int8 are made for any), or another perception.provider",
+            )
         provider = provider_of(self.manifest, provider)
-        self._engines = engine_folder(engines, provider, self.manifest.name, self.manifest.sha256)
-        self._prepared = Prepared.load(self._engines)
+        self.engines = engine_folder(engines, provider, self.manifest.name, self.manifest.sha256)
+        """The folder of its engines; None: its provider builds none."""
+        self._prepared = Prepared.load(self.engines)
         self._may_build = preparing or provider not in SLOW_TO_BUILD
         if not self._may_build and self._prepared is None:
             message = f"is not prepared for {provider}, which would build its engine for minutes"
             raise file.error(("file",), f"{self.manifest.file} {message}; run `flockd models prepare` first")
-        if self._engines is not None:
-            self._engines.mkdir(parents=True, exist_ok=True)
-        self._runtime = open_runtime(file, threads=threads, provider=provider, folder=self._engines)
+        if self.engines is not None:
+            self.engines.mkdir(parents=True, exist_ok=True)
+        self._runtime = open_runtime(file, threads=threads, provider=provider, folder=self.engines)
         _check_tensors(file, self._runtime.inputs, self._runtime.outputs)
         self._check_golden(file, provider, deadline)
 
@@ -87,11 +94,6 @@ class OnnxModel:
     def provider(self) -> str:
         """The provider that computes it, as the library reports; see `provider_of`."""
         return self._runtime.provider
-
-    @property
-    def engines(self) -> Path | None:
-        """The folder of its engines; None: its provider builds none."""
-        return self._engines
 
     def run(self, feeds: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
         """The outputs by name.
@@ -121,21 +123,12 @@ class OnnxModel:
 
     def keep_engines(self, shapes: Sequence[Shapes]) -> None:
         """Records that the engines in the folder cover these shapes and all between them."""
-        if self._engines is not None:
-            Prepared(shapes).save(self._engines)
+        if self.engines is not None:
+            Prepared(shapes).save(self.engines)
 
     def terminate(self) -> None:
         """Ends the current runs, from any thread; they raise errors of the library."""
         self._runtime.terminate()
-
-    def _refuse_provider(self, file: ManifestFile, provider: Provider) -> None:
-        made_for = self.manifest.providers
-        if made_for and provider not in made_for:
-            raise file.error(
-                ("providers",),
-                f"{self.manifest.name} is made for {' and '.join(made_for)}, not for {provider}; name another model "
-                "(flockd's own without _int8 are made for any), or another perception.provider",
-            )
 
     def _check_golden(self, file: ManifestFile, provider: Provider, deadline: Deadline) -> None:
         """Raises ModelError if mean or deviation of an output for the golden input differs from the manifest's."""

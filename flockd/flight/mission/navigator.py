@@ -15,7 +15,7 @@ from flockd.flight.geometry import Rig
 from flockd.flight.mission.circle_then_tangent import CircleThenTangent
 from flockd.flight.mission.guidance import Guidance, Mission, Moment, course_of
 from flockd.flight.mission.operator import Operator
-from flockd.flight.mission.velocity import Still, Velocity
+from flockd.flight.mission.velocity import Velocity
 from flockd.flight.mission.waypoints import Waypoints
 from flockd.flight.obstacles import AZIMUTHS, in_view
 
@@ -142,12 +142,13 @@ def _mission(parameters: MissionParameters, gate: GateParameters) -> Mission:
         case "circle_then_tangent":
             return CircleThenTangent(parameters)
         case "hover":
-            return Still("hovers")
+            return Velocity((0.0, 0.0), "hovers")
         case "velocity":
-            return Velocity(parameters)
+            assert parameters.velocity_m_s is not None  # checked by MissionParameters
+            return Velocity(parameters.velocity_m_s, "flies at its velocity")
         case "waypoints":
             return Waypoints(parameters, gate)
         case "follow":
-            return Still("follows the flock")
+            return Velocity((0.0, 0.0), "follows the flock")
         case "operator":
             return Operator(parameters)

@@ -1,31 +1,21 @@
-"""Missions with a constant velocity, and without one."""
+"""A mission with a constant velocity."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from flockd.core.config.mission import MissionParameters
 from flockd.flight.mission.guidance import Guidance, Moment, course_of
 
 
 class Velocity:
-    """Always flies the same velocity."""
+    """Always desires the same velocity; with zero the law still moves a drone that follows its flock (W_i = 0)."""
 
-    def __init__(self, parameters: MissionParameters) -> None:
-        assert parameters.velocity_m_s is not None  # checked by MissionParameters
-        self._velocity = np.array(parameters.velocity_m_s)
-
-    def step(self, moment: Moment) -> Guidance:
-        """See `Mission`."""
-        return Guidance(self._velocity, "flies at its velocity", course_of(self._velocity))
-
-
-class Still:
-    """Desires velocity zero: the law still keeps the flock together, and moves a drone that follows it (W_i = 0)."""
-
-    def __init__(self, sentence: str) -> None:
-        """`sentence`: what it does, for people."""
-        self._guidance = Guidance(np.zeros(2), sentence)
+    def __init__(self, velocity_m_s: Sequence[float], sentence: str) -> None:
+        """`velocity_m_s`: north and east; `sentence`: what it does, for people."""
+        velocity = np.array(velocity_m_s, dtype=float)
+        self._guidance = Guidance(velocity, sentence, course_of(velocity))
 
     def step(self, moment: Moment) -> Guidance:
         """See `Mission`."""

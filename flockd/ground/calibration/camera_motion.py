@@ -1,7 +1,7 @@
 """The motion of each camera by its own images, with covariance, for the calibration of a rig in flight.
 
 A match gives the directions of its point in both images; the depth map gives its range, with a large error. As in
-`ego_motion_refinement`, the part of a residual that a wrong depth explains has less weight. So near points contribute
+`geometry.ego_motion`, the part of a residual that a wrong depth explains has less weight. So near points contribute
 by their epipolar lines, and far ones fix the rotation.
 """
 

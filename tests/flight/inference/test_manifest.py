@@ -114,12 +114,11 @@ def shipped(name: str) -> Callable[[Path], Path]:
         (with_planes, {"inputs.rays.dtype": "uint8"}, "inputs.rays.dtype"),
         (with_planes, {"inputs.rays.shape": [1, "k", 8, 8]}, "inputs.rays.shape[1]"),
         (with_planes, {"inputs.rays.shape": [2, 8, 8]}, "inputs.rays.shape"),
-        (with_planes, {"inputs.rays.carries": "image"}, "inputs"),
+        (with_planes, {"inputs.rays.carries": "image"}, "inputs.rays.kind"),
         # for the roles of shipped ones
         (shipped("flow"), {"roles": ["stereo"]}, "roles[0]"),
         (shipped("flow"), {"roles": ["depth"]}, "inputs"),
         (shipped("flow"), {"outputs.flow.gives": "motion"}, "outputs"),
-        (shipped("flow"), {"thresholds": {"p": 1.0}}, "thresholds.p"),
         (shipped("distance"), {"crop": GONE}, "crop"),
         (shipped("distance"), {"thresholds.drone_probability": GONE}, "thresholds.drone_probability"),
         (shipped("distance"), {"thresholds.drone_probability": 80}, "thresholds.drone_probability"),

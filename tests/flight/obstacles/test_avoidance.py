@@ -14,7 +14,7 @@ from flockd.core.config.safety import GateParameters
 from flockd.core.messages import FloatArray, ObstacleRanges
 from flockd.flight.flocking import FlockingLaw
 from flockd.flight.obstacles import Avoidance
-from flockd.flight.obstacles.steering import free_way
+from flockd.flight.obstacles.avoidance import free_way
 from flockd.sim.flock.exact_states import ExactFlock
 from flockd.sim.vehicles.vehicles import Vehicles
 from flockd.sim.world.obstacles import Box, Frustum, Obstacles, Solid, true_ranges

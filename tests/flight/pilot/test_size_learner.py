@@ -18,8 +18,7 @@ from flockd.flight.geometry import log_polar_covariance
 from flockd.flight.perception import Observation
 from flockd.flight.perception.interface import KnownSize
 from flockd.flight.pilot import FlockPilot
-from flockd.flight.pilot.size_learner import scale_of
-from flockd.flight.pilot.weave import DURATION_S, PERIOD_S, Weave
+from flockd.flight.pilot.size_learner import DURATION_S, PERIOD_S, Weave, scale_of
 from tests.make import changed, frames, neighbour, scenario, vehicle
 
 STEP_S = 0.5

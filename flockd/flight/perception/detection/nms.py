@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -18,18 +17,13 @@ MAX_DETECTIONS = UNCLASSED - 1
 """Detections in one frame set: the labels that fit in a mask of bytes."""
 
 
-class Suppressed(NamedTuple):
-    """One detection for each drone, and the instances of each."""
+def suppress(
+    candidates: Sequence[Candidate], parameters: DetectionParameters, sure: float = 0.0
+) -> tuple[tuple[Detection, ...], Mapping[str, dict[int, int]]]:
+    """One detection for each drone; by camera, its label by the label of the first stage's instance.
 
-    detections: tuple[Detection, ...]
-    label_of: Mapping[str, dict[int, int]]
-    """By camera, the detection's label by the label of the first stage's instance."""
-
-
-def suppress(candidates: Sequence[Candidate], parameters: DetectionParameters, sure: float = 0.0) -> Suppressed:
-    """The detections: all candidates of one drone are fused, or those of at least the probability ``sure`` if any is.
-
-    Greedy, as usual: the candidate of the largest instance is compared first.
+    All candidates of one drone are fused, or those of at least the probability ``sure`` if any is. Greedy, as usual:
+    the candidate of the largest instance is compared first.
     """
     groups: list[list[Candidate]] = []
     for one in sorted(candidates, key=lambda candidate: -candidate.proposal.area_px):
@@ -44,7 +38,7 @@ def suppress(candidates: Sequence[Candidate], parameters: DetectionParameters, s
         for one in group:
             if one.proposal.instance:
                 label_of[one.proposal.cameras[0]][one.proposal.instance.label] = label
-    return Suppressed(tuple(detections), label_of)
+    return tuple(detections), label_of
 
 
 def are_one_drone(one: Candidate, other: Candidate, parameters: DetectionParameters) -> bool:

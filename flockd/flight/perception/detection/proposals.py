@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -26,22 +25,16 @@ _BORDER_PX = 2
 """A box this near to the image's border is cut by it: the first stage's maps have two image pixels a pixel."""
 
 
-class Roi(NamedTuple):
-    """A region of interest: a square virtual camera's direction and field of view."""
+@dataclass(frozen=True, eq=False)
+class Proposal:
+    """A region of interest, as a square virtual camera sees it, and its origin."""
 
+    cameras: tuple[str, ...]
+    """The cameras that show it."""
     direction: FloatArray
     """(3,) unit vector, body FRD."""
     half_angle: float
     """rad, from its centre to its borders."""
-
-
-@dataclass(frozen=True, eq=False)
-class Proposal:
-    """A region of interest, and its origin."""
-
-    cameras: tuple[str, ...]
-    """The cameras that show it."""
-    roi: Roi
     instance: Instance | None = None
     """The first stage's instance; None: the proposal comes from a prediction."""
 
@@ -65,8 +58,7 @@ def propose_instances(
         ranked = sorted(scene.instances, key=lambda one: (-one.score, -one.area_px))
         labels = {one.label for one in ranked[: parameters.max_proposals]}
         best = [one for one in scene.instances if one.label in labels]
-        rois = rois_of_instances(rig.cameras[name], best, rules)
-        found += [Proposal((name,), roi, one) for one, roi in zip(best, rois, strict=True) if roi is not None]
+        found += proposals_of_instances(rig.cameras[name], best, rules)
     return found
 
 
@@ -107,12 +99,12 @@ def propose_predictions(
         half_angle = float(rules.bounded(fitting, finest)[0])
         same = (angles_between(bearings, bearing) < half_angle) & (np.abs(log_range - log_ranges) < _SAME_RANGE)
         if not same.any():
-            proposals.append(Proposal(cameras, Roi(bearing, half_angle)))
+            proposals.append(Proposal(cameras, bearing, half_angle))
     return proposals, reasons
 
 
-def rois_of_instances(camera: RigCamera, instances: Sequence[Instance], rules: CropSpec) -> list[Roi | None]:
-    """Regions around boxes of the first stage; None if the lens images nothing there."""
+def proposals_of_instances(camera: RigCamera, instances: Sequence[Instance], rules: CropSpec) -> list[Proposal]:
+    """Regions around boxes of the first stage, without those where the lens images nothing."""
     if not instances:
         return []
     boxes, centres = np.array([one.box for one in instances]), np.array([one.centre for one in instances])
@@ -130,8 +122,8 @@ def rois_of_instances(camera: RigCamera, instances: Sequence[Instance], rules: C
     cut = (boxes[:, :2] < _BORDER_PX).any(1) | (boxes[:, 2:] > far_border).any(1)
     margin = np.where(cut, rules.cut_margin, rules.first_margin)
     half_angle = rules.bounded(margin * reach, camera.camera.pixel_angle(middle)).tolist()
-    directions = middle @ camera.T_body_camera.rotation.T
-    return [Roi(*roi) if one else None for one, *roi in zip(known.tolist(), directions, half_angle, strict=True)]
+    regions = zip(middle @ camera.T_body_camera.rotation.T, half_angle, instances, strict=True)
+    return [Proposal((camera.name,), *region) for one, region in zip(known.tolist(), regions, strict=True) if one]
 
 
 def pixel_angles(rig: Rig, cameras: Sequence[Sequence[str]], directions: FloatArray) -> FloatArray:

@@ -139,8 +139,8 @@ class Cascade:
         """
         count, of = len(proposals), np.array(proposals, np.object_)
         aims = _Aims(
-            np.array([one.roi.direction for one in proposals]).reshape(-1, 3),
-            np.array([one.roi.half_angle for one in proposals]),
+            np.array([one.direction for one in proposals]).reshape(-1, 3),
+            np.array([one.half_angle for one in proposals]),
             np.full(count, np.nan),
         )
         shown = Estimates(np.empty((count, 3)), *np.empty((5, count)))
@@ -241,7 +241,7 @@ class Cascade:
 
         They are centred on the drones, or on the proposals if no camera sees that direction.
         """
-        first = np.array([one.roi.direction for one in proposals]).reshape(-1, 3)
+        first = np.array([one.direction for one in proposals]).reshape(-1, 3)
         direction = np.where(self._rig.covers(estimates.bearing)[:, None], estimates.bearing, first)
         finest = pixel_angles(self._rig, [one.cameras for one in proposals], direction)
         before, range_m, most = aims.half_angle[at], np.exp(estimates.log_range), self._rules.max_resize

@@ -14,10 +14,10 @@ from flockd.flight.perception import SceneMaps, group_instances
 from flockd.flight.perception.detection.boxes import BoxRules, kept_boxes, probable_boxes, with_boxes
 from flockd.flight.perception.detection.instances import Instance
 from flockd.flight.perception.detection.proposals import (
-    Roi,
+    Proposal,
+    proposals_of_instances,
     propose_instances,
     propose_predictions,
-    rois_of_instances,
 )
 from flockd.flight.tracking import Prediction
 from tests.flight.perception.cameras import SECOND_STAGE
@@ -34,8 +34,8 @@ def instance(label: int, box: tuple[float, ...] | FloatArray, area_px: float = 1
     return Instance(label, (corners[:2] + corners[2:]) / 2, corners, area_px, score)
 
 
-def roi_of(box: tuple[float, ...], camera: RigCamera = CAMERA) -> Roi | None:
-    return rois_of_instances(camera, [instance(1, box)], RULES)[0]
+def region_of(box: tuple[float, ...], camera: RigCamera = CAMERA) -> Proposal | None:
+    return next(iter(proposals_of_instances(camera, [instance(1, box)], RULES)), None)
 
 
 # How wide.
@@ -43,9 +43,9 @@ def roi_of(box: tuple[float, ...], camera: RigCamera = CAMERA) -> Roi | None:
 
 def test_of_a_drone_that_the_images_border_cuts_a_wider_region_is_taken() -> None:
     def half_angle(left: float) -> float:
-        roi = roi_of((left, 220.0, left + 60.0, 260.0))
-        assert roi is not None
-        return roi.half_angle
+        region = region_of((left, 220.0, left + 60.0, 260.0))
+        assert region is not None
+        return region.half_angle
 
     assert half_angle(0.0) > 1.3 * half_angle(10.0)
     assert half_angle(640 - 60.0) > 1.3 * half_angle(640 - 70.0)
@@ -59,10 +59,10 @@ def test_where_a_lens_images_nothing_the_rest_of_a_box_counts() -> None:
     camera = RigCamera("front", lens, CAMERA.T_body_camera)
     radius = 160.0 * (1.0 - 1.0 / 3.0)  # where the polynomial turns
     assert np.isnan(lens.rays(np.array([[320.0 + 1.01 * radius, 240.0]]))).all()
-    partly = roi_of((370.0, 290.0, 410.0, 330.0), camera)
+    partly = region_of((370.0, 290.0, 410.0, 330.0), camera)
     assert partly is not None
     assert np.isfinite([*partly.direction, partly.half_angle]).all()
-    assert roi_of((600.0, 440.0, 640.0, 480.0), camera) is None
+    assert region_of((600.0, 440.0, 640.0, 480.0), camera) is None
 
 
 @pytest.mark.parametrize(("range_m", "searched"), [(3.2, 0), (9.0, 1), (1.0, 1)])

@@ -16,7 +16,7 @@ from flockd.flight.geometry import log_polar
 from flockd.flight.perception import Crop, Perception, RangeEstimates
 from flockd.flight.perception.detection.instances import Instance
 from flockd.flight.perception.detection.nms import fuse, suppress
-from flockd.flight.perception.detection.proposals import Proposal, Roi
+from flockd.flight.perception.detection.proposals import Proposal
 from flockd.flight.perception.detection.refinement import Candidate, Estimates
 from flockd.flight.perception.interface import KnownSize
 from tests.flight.pilot.flyer import Flyer, scenario_with
@@ -157,7 +157,7 @@ def candidate(
     turned = math.radians(turned_deg)
     bearing, log_range = log_polar(range_m * np.array([math.cos(turned), math.sin(turned), 0.0]))
     box: FloatArray = np.array([10.0, 10.0, 50.0, 40.0])
-    proposal = Proposal((camera,), Roi(bearing, 0.2), Instance(1, np.array([30.0, 25.0]), box, 600.0))
+    proposal = Proposal((camera,), bearing, 0.2, Instance(1, np.array([30.0, 25.0]), box, 600.0))
     return Candidate(proposal, bearing, log_range, sigma, 0.004, size_m, 0.9)
 
 
@@ -165,7 +165,7 @@ def candidate(
 def test_a_doubtful_candidate_does_not_move_a_sure_one(sure: float, range_m: float) -> None:
     """Of 0.97 at 4 m and 0.9 at 4.2 m, equally vague: alone, or their mean where both are sure or none is."""
     both = [replace(candidate(4.0, 0.05), drone_probability=0.97), candidate(4.2, 0.05, camera="left")]
-    assert [one.range_m for one in suppress(both, PARAMETERS, sure).detections] == [pytest.approx(range_m)]
+    assert [one.range_m for one in suppress(both, PARAMETERS, sure)[0]] == [pytest.approx(range_m)]
 
 
 @pytest.mark.parametrize(
@@ -183,7 +183,7 @@ def test_candidates_are_one_drone_by_their_mahalanobis_distance(
     range_m: float, turned_deg: float, sigma: float, same: bool
 ) -> None:
     both = [candidate(4.0, sigma), candidate(range_m, sigma, turned_deg=turned_deg, camera="left")]
-    assert len(suppress(both, PARAMETERS).detections) == (1 if same else 2)
+    assert len(suppress(both, PARAMETERS)[0]) == (1 if same else 2)
 
 
 def test_a_fused_detection_is_the_weighted_mean_with_the_best_ones_variance() -> None:

@@ -14,8 +14,7 @@ from flockd.core.config.perception import RangeFinderParameters
 from flockd.core.messages import FloatArray, GroundEstimate, RangeReading, Reason, ReasonKind, VehicleState
 from flockd.flight.geometry import rotation_from_euler
 from flockd.flight.pilot import FlockPilot
-from flockd.flight.pilot.ground import GroundFilter
-from flockd.flight.pilot.ground.contradiction import ContradictionMonitor
+from flockd.flight.pilot.ground import ContradictionMonitor, GroundFilter
 from flockd.sim.autopilot.fake_range_finder import range_to_ground
 from tests.flight.pilot.flyer import Flyer, scenario_with
 from tests.make import changed, vehicle

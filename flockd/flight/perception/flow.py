@@ -1,4 +1,4 @@
-"""Refines a flow on a grid of points, and interpolates the corrections between them."""
+"""Optical flow: dense, by a network or by OpenCV's DIS, then refined on a grid of points."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockd.core.messages import UNCLASSED, BoolArray, Float32Array, UInt8Array
+from flockd.flight.inference.fitting import fit
+from flockd.flight.inference.session import OnnxModel
 
 _GRID_PX = 16
 """Distance of the points. With 8 px the flow between them is as exact, for three times the time."""
@@ -43,6 +45,45 @@ _HOMOGRAPHY_MIN_POINTS = 30
 _HOMOGRAPHY_TOLERANCE_PX = 4.0
 _HOMOGRAPHY_MAX_ERROR = 0.25
 """Largest median error of a useful homography, relative to the image's width."""
+
+
+class DisFlow:
+    """OpenCV's dense inverse search (Kroeger et al. 2016): alone on small computers, or after another flow.
+
+    It is exact to a fraction of a pixel if it converges, but loses large motions; a network is the opposite.
+    """
+
+    def __init__(self, start: OnnxFlow | None = None) -> None:
+        """``start``: the flow that initialises the coarsest scale; None: no motion."""
+        self._start = start
+        self._idle: list[cv2.DISOpticalFlow] = []
+        """Instances not in use: none serves two callers at once. Reusing one's memory saves a third of the time."""
+
+    def flow(self, first: UInt8Array, second: UInt8Array) -> Float32Array:
+        """(h, w, 3) RGB twice -> (h, w, 2): the displacement of each pixel of the first image, right and down."""
+        before, after = grey(first), grey(second)
+        start = np.zeros((*before.shape, 2), np.float32) if self._start is None else self._start.flow(first, second)
+        dis = self._idle.pop() if self._idle else cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+        try:
+            return np.asarray(dis.calc(before, after, start), dtype=np.float32)
+        finally:
+            self._idle.append(dis)
+
+
+class OnnxFlow:
+    """A flow network; scales images as its manifest asks."""
+
+    def __init__(self, model: OnnxModel) -> None:
+        self._model = model
+
+    def flow(self, first: UInt8Array, second: UInt8Array) -> Float32Array:
+        """(h, w, 3) RGB twice -> (h, w, 2): the displacement of each pixel of the first image, right and down."""
+        height, width = first.shape[:2]
+        fitting = fit(self._model.manifest, (width, height))
+        outputs = self._model.infer({"first": [fitting.enter(first)], "second": [fitting.enter(second)]})
+        flow = fitting.inside(outputs["flow"])[0].transpose(1, 2, 0) / np.array(fitting.scale, np.float32)
+        full = cv2.resize(flow, (width, height), interpolation=cv2.INTER_LINEAR)
+        return np.asarray(full, dtype=np.float32)
 
 
 def grid_flow(flow: Float32Array, first: UInt8Array, second: UInt8Array, labels: UInt8Array) -> Float32Array:
