@@ -92,13 +92,14 @@ def recording_of_bag(
     began_ns = next((stamp_ns(bag.read(one)) for one in bag.messages(topics)), 0)
     states = _states(bag, _vehicle_topic(bag, vehicle_topic), config, began_ns, tell)
     steps, kept, lost = 0, 0, Counter[str]()
+    times: dict[str, list[tuple[int, int]]] = {}
     with McapFile(target) as file:
         facts = {"format": FORMAT, "drone": config.name, "images": "png", "recording": uuid.uuid4().hex}
         file.write(Note(FLIGHT_NOTE, {**facts, "from_bag": bag.path.name}))
         file.write(Note(MODELS_NOTE, model_hashes(config.perception)))
         file.write(Inclosure(CONFIGURATION, "application/json", config.model_dump_json(indent=1).encode()))
         last_s = -np.inf
-        for frames in _sets(bag, topics, config, began_ns, lost):
+        for frames in _sets(bag, topics, config, began_ns, lost, times):
             vehicle = states.at(frames.time_s + config.rig.time_offset_s)
             if vehicle is None:
                 lost[f"all cameras: no state of the vehicle within {LONGEST_GAP_S:g} s"] += len(frames.frames)
@@ -111,6 +112,7 @@ def recording_of_bag(
                 kept += is_image(entry.stream.topic)
             steps += 1
         file.write(Note(END_NOTE, {"steps": str(steps), "lost": "0"}))
+    _check_stamps(bag, times)
     if steps == 0:
         raise RecordingError(
             f"{bag.path}: has no image with a state of the vehicle within {LONGEST_GAP_S:g} s of it; are their stamps "
@@ -138,14 +140,33 @@ def _compare_lenses(bag: Bag, config: DroneConfig, kinds: Mapping[str, str]) -> 
             raise RecordingError(f"{bag.path}: camera {camera.name}: {topic} {fault}")
 
 
+_PACE = 20.0
+"""Most by which a simulator's time is slower or faster than the recorder's clock."""
+
+
+def _check_stamps(bag: Bag, times: Mapping[str, Sequence[tuple[int, int]]]) -> None:
+    """Raises RecordingError where images' stamps do not advance as the time does in which they were recorded."""
+    for topic, both in times.items():
+        stamps_s, recorded_s = (1e-9 * (last - first) for first, last in zip(both[0], both[-1], strict=True))
+        if len(both) > 1 and not recorded_s / _PACE <= stamps_s <= recorded_s * _PACE:
+            raise RecordingError(
+                f"{bag.path}: stamps of {topic} advance by {stamps_s:g} s in the {recorded_s:g} s in which they were "
+                "recorded; correct their publisher's clock or its unit"
+            )
+
+
 def _sets(
     bag: Bag,
     topics: Mapping[str, Sequence[CameraDeviceParameters]],
     config: DroneConfig,
     began_ns: int,
     lost: Counter[str],
+    times: dict[str, list[tuple[int, int]]],
 ) -> Iterator[RawFrameSet]:
-    """Frames by their stamps, as a drone puts them together; the clock begins with the first one's."""
+    """Frames by their stamps, as a drone puts them together; the clock begins with the first one's.
+
+    ``times`` gets each topic's stamps, and the times at which they were recorded, ns.
+    """
     assert config.source is not None
     sizes = {camera.name: camera.size_px for camera in config.rig.cameras}
     assembler = Assembler(tuple(sizes), config.source)
@@ -155,6 +176,7 @@ def _sets(
         first = cameras[0]
         size = sizes[first.name] if first.crop is None else config.source.whole_px(first)
         image = image_of(bag.read(message))
+        times.setdefault(message.topic, []).append((image.stamp_ns, message.time_ns))
         time_s, number = _time_s(image.stamp_ns, began_ns), 0
         if (before := last.get(message.topic)) is not None:
             number = before.sequence + max(round((time_s - before.time_s) * first.rate_hz), 1)

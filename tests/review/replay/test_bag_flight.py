@@ -298,6 +298,30 @@ def test_images_without_a_state_are_counted(tmp_path: Path) -> None:
     assert told == [f"{theirs}: 6 images could not be used: {why}"]
 
 
+@pytest.mark.parametrize(
+    "stamp_ns",
+    [
+        lambda ns: 0,
+        lambda ns: ns // 1000,
+        lambda ns: 2 * BEGAN_NS - ns,
+        lambda ns: ns + (ns > BEGAN_NS + 5e8) * 36 * 10**11,
+    ],
+    ids=["zero", "microseconds", "backwards", "an hour ahead from the middle on"],
+)
+def test_stamps_that_do_not_advance_with_the_recording_are_refused(
+    stamp_ns: Callable[[int], int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It was a flight of one step, or of an hour, with exit code 0."""
+    right = header
+    monkeypatch.setattr(f"{__name__}.header", lambda time_ns: right(stamp_ns(time_ns)))
+    (tmp_path / "theirs.yaml").write_text(json.dumps(DRONE), encoding="utf-8")
+    with (
+        Bag(bag(tmp_path / "bag")) as theirs,
+        pytest.raises(RecordingError, match="stamps of /front/image_raw advance"),
+    ):
+        recording_of_bag(theirs, load_drone(tmp_path / "theirs.yaml"), None, tmp_path / "ours.mcap")
+
+
 def test_a_part_of_a_bag_is_told_to_be_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     theirs = bag(tmp_path / "bag")
     assert main(["replay", str(theirs / "bag.mcap")]) == 1
