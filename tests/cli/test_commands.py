@@ -185,7 +185,7 @@ def test_config_check_tells_what_a_drone_could_not_start_with_or_would_not_see(
     assert f"telemetry.zenoh_config: {drone.with_name('none.json5')}: cannot be used as zenoh's settings (" in problem
     drone.write_text(SIMULATOR.replace("yaw_deg: 90.0", "yaw_deg: 1.57"), encoding="utf-8")
     assert main(["config", "check", str(drone)]) == 0
-    blind = f"warning: {drone}: rig: blind at the horizon from "
+    blind = f"warning: {drone}: coverage: blind at the horizon from "
     assert capsys.readouterr().err.startswith(blind)
     drone.write_text(SIMULATOR.replace("position_m: [0.10,", "position_m: [100,"), encoding="utf-8")
     told_of = told(78, "config", "check", drone)
