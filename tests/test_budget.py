@@ -21,7 +21,7 @@ from flockd.onboard.recording.reader import Recording
 ROOT = Path(__file__).parents[1]
 LINES = {
     "flockd/core": 3_360,
-    "flockd/flight": 9_850,
+    "flockd/flight": 9_720,
     "flockd/onboard": 9_250,
     "flockd/fleet": 2_710,
     "flockd/ground": 5_340,
@@ -37,7 +37,7 @@ LINES = {
     "tools/training": 4_330,
 }
 """Lines of Python below a folder."""
-FILES = {"flockd": 325}
+FILES = {"flockd": 314}
 NUMBERS_OF_FLIGHT = 199
 """In constants of the modules of `flockd/flight`."""
 SLACK = 0.02

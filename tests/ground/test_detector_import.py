@@ -200,7 +200,7 @@ def test_what_is_no_onnx_file_is_refused(tmp_path: Path, capsys: pytest.CaptureF
     (tmp_path / "best.onnx").write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:abc\n")
     assert imported(tmp_path / "best.onnx") == 78
     assert "best.onnx: is a pointer of Git LFS; fetch the file with `git lfs pull`" in capsys.readouterr().err
-    assert imported(tmp_path / "other.onnx") == 78
+    assert imported(tmp_path / "other.onnx") == 2
     assert "cannot be read (No such file or directory)" in capsys.readouterr().err
     file = written(tmp_path / "mine.onnx", yolov8(), said=AGPL)
     assert main(["models", "import", str(file), "--drone", "drone", "--licence", "MIT", "--out", str(tmp_path)]) == 2

@@ -291,7 +291,7 @@ def test_links_to_nothing_and_pipes_among_pictures_are_named(capsys: Capture, to
     [
         ("a.jpg", b"", "is empty"),
         ("a.jpg", b"no picture", "is no image"),
-        ("a.png", b"GIF89a" + bytes(99), "is of a format that is not read; save it as PNG"),
+        ("a.png", b"GIF89a" + bytes(99), "is of a format that is not read; save it as JPEG or PNG"),
         ("a.jpg", b"version https://git-lfs.github.com/spec/v1\noid", "is a pointer of Git LFS; fetch the file with"),
         ("a.png", _animated(), "has 2 pages, of which one would be read; save each as an image"),
         ("a.jpg", b"P6\n60000 60000\n255\n", "has more pixels than any camera, or none"),

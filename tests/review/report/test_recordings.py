@@ -337,7 +337,7 @@ def test_what_cannot_be_read_is_one_sentence_and_leaves_nothing(
     if content is not None:
         bad.write_bytes(content if isinstance(content, bytes) else (flight / "drone1.mcap").read_bytes()[:content])
     before = set(tmp_path.iterdir())
-    _, err = told(capsys, 1, bad)
+    _, err = told(capsys, 2 if content is None else 1, bad)
     assert err.startswith(f"{bad}: ")
     assert all(line.startswith("writing the report: ") for line in err.splitlines()[1:])
     assert set(tmp_path.iterdir()) == before
