@@ -45,8 +45,9 @@ OF_A_BAG = (
     "is a part of a bag of ROS 2; `flockd replay` takes the bag's folder, in which metadata.yaml is, and --config"
 )
 
-_APART_S = 3.0
-"""Longest time between a step and its images, or the state of its vehicle: `rig.time_offset_s` is 1 s at most."""
+_APART_S = 3600.0
+"""Longest time between a step and its images, or the state of its vehicle, which may be of a link that was lost: no
+flight lasts an hour."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,10 +187,10 @@ class Recording:
             raise RecordingError(f"{self.path}: step {number} lists a camera twice; use another copy")
         yield RecordedStep(number, FrameSet(listed.time_s, frames), vehicle, output, truth, order)
 
-    def _of_step(self, what: str, time_s: float | None, step_s: float) -> None:
+    @staticmethod
+    def _of_step(what: str, time_s: float | None, step_s: float) -> None:
         """Raises ValueError for what is of another time than its step, or of none that is finite."""
-        source = self.config.source
-        if time_s is None or not abs(time_s - step_s) <= max(_APART_S, source.set_tolerance_s if source else 0.0):
+        if time_s is None or not abs(time_s - step_s) <= _APART_S:
             raise ValueError(f"{what} is of {time_s} s, and the step of {step_s:g} s")
 
     def _of_rig(self, camera: str, image: UInt8Array) -> UInt8Array:
@@ -268,11 +269,7 @@ def _note(found: Contents, path: Path, record: Record | Damage) -> None:
                 if found.steps and sequence <= (last := found.steps[-1][0]):
                     told = f"step {sequence} comes behind step {last}, as in recordings that were joined"
                     raise RecordingError(f"{path}: {told}; use those themselves")
-                time_s = _time_of(path, data)
-                if found.steps and time_s <= found.steps[-1][1]:
-                    told = f"step {sequence} is at {time_s:g} s, not behind the one before, at {found.steps[-1][1]:g} s"
-                    raise RecordingError(f"{path}: {told}; use another copy")
-                found.steps.append((sequence, time_s))
+                found.steps.append((sequence, _time_of(path, data)))
         case Note(name, facts_of_end) if name == streams.END_NOTE:
             if not re.fullmatch("[0-9]{1,9}", lost := facts_of_end.get("lost", "0")):
                 raise RecordingError(f"{path}: says lost {lost[:20]!r}, which is no number; use another copy")

@@ -283,18 +283,7 @@ def test_a_step_without_its_vehicle_is_the_last_of_a_killed_one_or_an_error(tmp_
         list(Recording(odd.path).steps())
 
 
-@pytest.mark.parametrize("time_s", [0.0, -3.0])
-def test_a_clock_that_stands_or_goes_back_is_refused(time_s: float, tmp_path: Path, whole: Path) -> None:
-    def changed(one: Record) -> Record:
-        if not (isinstance(one, Entry) and one.stream.topic == "/frames" and one.sequence == 4):
-            return one
-        return replace(one, data=json.dumps({**json.loads(one.data), "time_s": time_s}).encode())
-
-    told = refusal(rewritten(whole, tmp_path / "back.mcap", changed))
-    assert told.startswith(f"step 4 is at {time_s:g} s, not behind the one before, at ")
-
-
-@pytest.mark.parametrize("off_s", [-10.0, 1e9, math.nan])
+@pytest.mark.parametrize("off_s", [-4000.0, 1e9, math.nan])
 @pytest.mark.parametrize(("topic", "what"), [("/vehicle", "the state of the vehicle"), ("/frames", "camera front")])
 def test_images_and_states_of_another_time_than_their_step_are_refused(
     off_s: float, topic: str, what: str, tmp_path: Path, whole: Path
