@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from flockd.review.replay.dataset_flight import Depth
     from flockd.review.replay.difference import Comparison
 
+MOST_SCALE = 3.0
+"""Of motions by the images relative to those by a dataset's poses; a depth network errs by less where it never was."""
 _OF_RECORDINGS = ("start", "end", "out", "diff", "reference", "update_reference", "tolerance")
 _OF_DATASETS = ("depth", "stride", "flow")
 
@@ -285,6 +287,12 @@ def _run_dataset(args: argparse.Namespace) -> int:
     say_facts(args, result if args.json else {**result, "pairs": len(pairs)}, *lines)
     if not any(pair.found for pair in pairs):
         complain(f"{dataset.path}: no motion could be estimated: {pairs[0].reason}")
+        return ExitCode.CHECK_FAILED
+    if (scale := result["scale"]) is not None and not 1 / MOST_SCALE < scale < MOST_SCALE:
+        complain(
+            f"{dataset.path}: motions by the images are {scale:.3g} times as long as by poses.txt; write poses in "
+            "metres, and depth maps in millimetres (TUM's have 5000 units to a metre)"
+        )
         return ExitCode.CHECK_FAILED
     return ExitCode.DONE
 

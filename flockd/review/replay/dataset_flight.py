@@ -62,10 +62,12 @@ def dataset_config(dataset: Dataset, config: DroneConfig | None, depth: Depth, f
 def dataset_result(pairs: Sequence[Pair]) -> dict[str, Any]:
     """The result of a replay as JSON, for `flockd replay --json`."""
     errors = [pair.error for pair in pairs if pair.error]
+    scales = [pair.scale for pair in pairs if pair.scale is not None]
     return {
         "pairs": [_pair_result(pair) for pair in pairs],
         "rotation_error_deg": spread([rotation for rotation, _ in errors], "median", "p95", "max"),
         "translation_error_m": spread([translation for _, translation in errors], "median", "p95", "max"),
+        "scale": float(np.median(scales)) if scales else None,
         "estimated_ratio": sum(pair.found is not None for pair in pairs) / len(pairs),
     }
 
@@ -88,6 +90,8 @@ def _pair_result(pair: Pair) -> dict[str, Any]:
 _FLAT_DEVIATION = 1.0
 """Standard deviation in grey levels below which an image shows nothing: matched with any image, it would seem to stand
 still."""
+
+_LEAST_WAY_M = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,6 +119,13 @@ class Pair:
             return None
         rotation = rotation_angle_deg(self.found.rotation.T @ self.true.rotation)
         return rotation, float(np.linalg.norm(self.found.translation - self.true.translation))
+
+    @property
+    def scale(self) -> float | None:
+        """Length of the motion relative to that by the poses; None without both, or without a motion."""
+        if self.found is None or self.true is None or (way := np.linalg.norm(self.true.translation)) < _LEAST_WAY_M:
+            return None
+        return float(np.linalg.norm(self.found.translation) / way)
 
 
 class RecordedDepth(OneByOne):

@@ -85,6 +85,23 @@ def test_too_little_depth_is_no_motion(folder: Path, capsys: Capture) -> None:
     assert "no motion could be estimated: ego-motion: fewer than three pairs" in captured.err
 
 
+@pytest.mark.parametrize(("maps", "poses", "told"), [(5, 1, "5"), (1, 1000, "0.00")], ids=["tum", "millimetres"])
+def test_depth_or_poses_in_other_units_are_told(
+    maps: int, poses: int, told: str, folder: Path, capsys: Capture
+) -> None:
+    for file in (folder / "depth").iterdir():
+        depth = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        assert depth is not None
+        cv2.imwrite(str(file), maps * depth)
+    rows = np.loadtxt(folder / "poses.txt").reshape(-1, 4, 4)
+    rows[:, :3, 3] *= poses
+    np.savetxt(folder / "poses.txt", rows.reshape(-1, 16))
+    assert main(["replay", str(folder), "--depth", "recorded", "--flow", "dis"]) == 1
+    sentence = capsys.readouterr().err.splitlines()[-1]
+    assert sentence.startswith(f"{folder}: motions by the images are {told}")
+    assert "times as long as by poses.txt; write poses in metres, and depth maps in millimetres" in sentence
+
+
 # What people's files come with.
 
 
