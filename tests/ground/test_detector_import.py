@@ -201,7 +201,7 @@ def test_what_is_no_onnx_file_is_refused(tmp_path: Path, capsys: pytest.CaptureF
     assert imported(tmp_path / "best.onnx") == 78
     assert "best.onnx: is a pointer of Git LFS; fetch the file with `git lfs pull`" in capsys.readouterr().err
     assert imported(tmp_path / "other.onnx") == 2
-    assert "cannot be read (No such file or directory)" in capsys.readouterr().err
+    assert "other.onnx: does not exist; check the path" in capsys.readouterr().err
     file = written(tmp_path / "mine.onnx", yolov8(), said=AGPL)
     assert main(["models", "import", str(file), "--drone", "drone", "--licence", "MIT", "--out", str(tmp_path)]) == 2
     assert "is the file itself; name another folder with --out" in capsys.readouterr().err
