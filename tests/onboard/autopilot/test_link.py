@@ -262,7 +262,7 @@ async def test_no_system_outlives_a_search_that_fails(address: str, fake_autopil
             super().destroy()
 
     with pytest.raises(AutopilotError, match="heard instead: 1"):
-        await AutopilotLink.connect(_parameters(address, system_id=5), timeout_s=0.7, clock=clock, create=Watched)
+        await AutopilotLink.connect(_parameters(address, system_id=5), timeout_s=3.0, clock=clock, create=Watched)
     await until(lambda: bool(alive_at_the_end))
     assert handed_out
     assert alive_at_the_end[0] == 0
