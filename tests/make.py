@@ -101,7 +101,7 @@ def request(
 
 def quiet(**changes: Any) -> Inputs:
     """What a supervisor hears in a flight with four cameras in which nothing is the matter."""
-    sees = CameraHealth(age_s=0.02, period_s=0.033, unplugged=False, frozen=False, noisy=False)
+    sees = CameraHealth(age_s=0.02, period_s=0.033, fault=None)
     fine = Inputs(
         cameras=dict.fromkeys(("front", "right", "back", "left"), sees), dropped_share=0.01, estimate_age_s=0.4,
         ego_motion_age_s=0.0, network_faults=0, inference_stuck=False, load=0.6, temperature_c=60.0, loop_lag_s=0.01,

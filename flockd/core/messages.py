@@ -373,7 +373,7 @@ class SizeStatus:
 
 @dataclass(frozen=True)
 class LearnedSize:
-    """The size of the others that a pilot learned, for the pilot of the next flight."""
+    """The size of the others: configured, or learned by a pilot, also for the pilot of the next flight."""
 
     size_m: float
     """From tip to tip."""

@@ -23,7 +23,8 @@ from flockd.core.config.perception import PerceptionConfig
 from flockd.core.data import data_path
 from flockd.core.messages import UNCLASSED, Detection, Frame, FrameSet, VehicleState
 from flockd.flight.geometry import RangeMap, Rig, RigCamera
-from flockd.flight.perception import DisFlow, OnnxNetworks, Perception
+from flockd.flight.perception import OnnxNetworks, Perception
+from flockd.flight.perception.flow import DisFlow
 from flockd.flight.pilot.ground import level_ground
 from flockd.sim.renderer.drone_models import FAMILIES, drone_model
 from tools.training.dataset import R_BODY_CAMERA, PairSet, open_pairs, rig_camera

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockd.flight.inference import OnnxModel
-from flockd.flight.perception import group_instances
 from flockd.flight.perception.detection.boxes import BoxRules, kept_boxes, probable_boxes
+from flockd.flight.perception.detection.instances import group_instances
 from tools.training.dataset import PairSet, ground_plane, open_pairs, ray_tangents
 from tools.training.pictures import PROPOSALS, pictures_in, read
 

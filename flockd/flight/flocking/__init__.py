@@ -3,11 +3,6 @@
 from __future__ import annotations
 
 from flockd.core.config.flocking import FlockingParameters
-from flockd.flight.flocking.law import FlockingLaw, level_offsets, lookahead_s
+from flockd.flight.flocking.law import FlockingLaw
 
-__all__ = [
-    "FlockingLaw",
-    "FlockingParameters",
-    "level_offsets",
-    "lookahead_s",
-]
+__all__ = ["FlockingLaw", "FlockingParameters"]

@@ -39,16 +39,9 @@ class RigCamera:
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """All cameras, by name. Raises ValueError without cameras, or if a name does not fit its camera."""
+    """All cameras, by name."""
 
     cameras: Mapping[str, RigCamera]
-
-    def __post_init__(self) -> None:
-        if not self.cameras:
-            raise ValueError("a rig has at least one camera")
-        for name, camera in self.cameras.items():
-            if camera.name != name:
-                raise ValueError(f"camera {camera.name!r} is filed under the name {name!r}")
 
     def covers(self, directions: FloatArray, without: Set[str] = frozenset()) -> BoolArray:
         """Mask (n,): body directions (n, 3) in view of any camera that is not in ``without``."""

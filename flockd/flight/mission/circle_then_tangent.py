@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from flockd.core.config.mission import MissionParameters
-from flockd.core.messages import FloatArray, MissionStatus
+from flockd.core.messages import FloatArray
 from flockd.flight.mission.guidance import Guidance, Moment
 
 
@@ -22,13 +22,6 @@ class CircleThenTangent:
         p, time_s = self._parameters, moment.time_s
         where = "on the circle" if time_s < p.circle_until_s else "along the tangent"
         return Guidance(desired_velocity(p, time_s), where, course(p, time_s))
-
-
-def desired_of(parameters: MissionParameters, t: float, status: MissionStatus) -> FloatArray:
-    """(2,) m/s: desired velocity at `t` seconds into the flight; by Eq. 43 if a recording lacks the circle's status."""
-    if not status.known and parameters.kind == "circle_then_tangent":
-        return desired_velocity(parameters, t) * parameters.pull
-    return status.desired
 
 
 def desired_velocity(parameters: MissionParameters, t: float) -> FloatArray:

@@ -9,7 +9,7 @@ import numpy as np
 from flockd.core.config.avoidance import ObstacleParameters
 from flockd.core.config.safety import GateParameters
 from flockd.core.messages import SECTORS, FloatArray, ObstacleRanges
-from flockd.flight.flocking import FlockingLaw, level_offsets, lookahead_s
+from flockd.flight.flocking.law import FlockingLaw, level_offsets, lookahead_s
 from flockd.flight.geometry.level import limit_norm
 from flockd.flight.obstacles.local_map import AZIMUTHS, nearest_points
 from flockd.flight.safety.approach import stopping_speed, towards_flying_on, towards_obstacles

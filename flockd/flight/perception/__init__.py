@@ -1,7 +1,5 @@
 """Perception: frames in, an observation out; each role is an ONNX model with a manifest."""
 
-from flockd.flight.perception.detection.instances import group_instances
-from flockd.flight.perception.flow import DisFlow
 from flockd.flight.perception.interface import (
     Crop,
     ImagePair,
@@ -18,7 +16,6 @@ from flockd.flight.perception.pipeline import Perception
 
 __all__ = [
     "Crop",
-    "DisFlow",
     "ImagePair",
     "ImageView",
     "Networks",
@@ -28,7 +25,6 @@ __all__ = [
     "Perception",
     "RangeEstimates",
     "SceneMaps",
-    "group_instances",
     "load_networks",
     "outcome",
 ]

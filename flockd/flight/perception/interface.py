@@ -49,14 +49,6 @@ class Crop(NamedTuple):
     """Log odds of a drone known before; they are added to the crop's."""
 
 
-@dataclass(frozen=True)
-class KnownSize:
-    """Size of every drone of the fleet, from tip to tip, and its standard deviation."""
-
-    size_m: float
-    sigma_m: float
-
-
 class RangeEstimates(NamedTuple):
     """The second stage's estimates from n crops; NaN: there is none."""
 

@@ -6,11 +6,20 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 from flockd.core.config.perception import PerceptionConfig
-from flockd.core.messages import Float32Array, Frame, FrameSet, GroundEstimate, Reason, ReasonKind, VehicleState
+from flockd.core.messages import (
+    Float32Array,
+    Frame,
+    FrameSet,
+    GroundEstimate,
+    LearnedSize,
+    Reason,
+    ReasonKind,
+    VehicleState,
+)
 from flockd.flight.geometry import RangeMap, Rig, ground_inverse_depth, range_map
 from flockd.flight.perception.detection.detector import DetectionTrace, Detector, without_borders
 from flockd.flight.perception.image_monitor import ImageMonitor
-from flockd.flight.perception.interface import ImagePair, ImageView, KnownSize, Networks, SceneMaps
+from flockd.flight.perception.interface import ImagePair, ImageView, Networks, SceneMaps
 from flockd.flight.perception.observation import CameraObservation, Observation
 from flockd.flight.tracking import Prediction
 
@@ -23,7 +32,7 @@ class Perception:
     def __init__(self, rig: Rig, networks: Networks, config: PerceptionConfig) -> None:
         self._rig, self._networks, self._config = rig, networks, config
         size_m = config.drone_size_m
-        self._said_size = None if size_m is None else KnownSize(size_m, config.drone_size_sigma_m)
+        self._said_size = None if size_m is None else LearnedSize(size_m, config.drone_size_sigma_m / size_m)
         self._detector = Detector(rig, networks, config.detection)
         self._needs_ground = config.scale == "height"
         self._monitor = ImageMonitor(rig.cameras, config.noise)
@@ -37,7 +46,7 @@ class Perception:
         predictions: Sequence[Prediction] = (),
         trace: DetectionTrace | None = None,
         lap: Callable[[str], None] = lambda stage: None,
-        learned_size: KnownSize | None = None,
+        learned_size: LearnedSize | None = None,
     ) -> Observation:
         """The observation of the newest frame set.
 

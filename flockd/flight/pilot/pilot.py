@@ -40,7 +40,6 @@ from flockd.flight.mission.navigator import Lookout, middle_of
 from flockd.flight.obstacles import Avoidance, LocalMap, ObstacleRanging, nothing_found
 from flockd.flight.perception import Networks, Observation, Perception, load_networks
 from flockd.flight.perception.detection.detector import DetectionTrace
-from flockd.flight.perception.interface import KnownSize
 from flockd.flight.pilot.camera_agreement import CameraAgreement, moves_otherwise
 from flockd.flight.pilot.ground import GroundFilter
 from flockd.flight.pilot.motions import background_pairs
@@ -146,8 +145,7 @@ class FlockPilot:
         predictions = self._predictions(frames.time_s)
         ground, why_no_ground = (None, None) if self._ground is None else self._ground.update(vehicle)
         learned = self._size.learned
-        known = None if learned is None else KnownSize(learned.size_m, learned.sigma * learned.size_m)
-        observation = self._perception.observe(frames, vehicle, ground, predictions, trace.detection, laps.end, known)
+        observation = self._perception.observe(frames, vehicle, ground, predictions, trace.detection, laps.end, learned)
         trace.observation = observation
         if self._config.perception.height == "barometer":
             ground = None  # the height alone gives the same

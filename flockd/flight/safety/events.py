@@ -22,12 +22,9 @@ class CameraHealth:
     """Age of its newest usable frame; infinite before the first."""
     period_s: float
     """Expected time between its frames."""
-    unplugged: bool
-    """Whether its device reported an error or is gone, and is not open again yet."""
-    frozen: bool
-    """Whether it keeps sending the same image or the same sequence number."""
-    noisy: bool
-    """Whether its images have been noise for too long."""
+    fault: str | None
+    """`unplugged`: its device reported an error or is gone, and is not open again yet. `frozen`: it keeps sending the
+    same image or the same sequence number. `noisy`: its images have been noise for too long. None: none of these."""
 
 
 class MissionEnd(StrEnum):
@@ -173,7 +170,8 @@ def link_lost(heartbeat_age_s: float, message_age_s: float, p: SafetyParameters)
 
 def notice(inputs: Inputs, p: SafetyParameters) -> dict[Event, str]:
     """The events present in the inputs, each with one short sentence for people; empty in a flight without faults."""
-    lost = [f"{name} {fault}" for name, camera in inputs.cameras.items() if (fault := _fault(camera, p))]
+    fresh = {name for name, one in inputs.cameras.items() if one.age_s <= p.camera_timeout_periods * one.period_s}
+    lost = [f"{name} {one.fault or 'silent'}" for name, one in inputs.cameras.items() if one.fault or name not in fresh]
     sightless = len(lost) == len(inputs.cameras) or len(lost) > p.max_lost_cameras
     lost_link = link_lost(inputs.heartbeat_age_s, inputs.message_age_s, p)
     # While another sender's setpoints are followed, the own ones are not.
@@ -254,14 +252,3 @@ def _older(limits: Mapping[Event, float], age_s: float, sentence: str) -> list[t
 
 def _since(age_s: float) -> str:
     return "yet" if age_s == math.inf else f"for {age_s:.1f} s"
-
-
-def _fault(camera: CameraHealth, p: SafetyParameters) -> str:
-    """The fault of a camera, in one word; empty without a fault."""
-    if camera.unplugged:
-        return "unplugged"
-    if camera.frozen:
-        return "frozen"
-    if camera.noisy:
-        return "noisy"
-    return "" if camera.age_s <= p.camera_timeout_periods * camera.period_s else "silent"

@@ -41,7 +41,6 @@ class Prediction:
     """(3,) metres, NED, own drone at the origin."""
     size_m: float
     """As of `Detection.size_m`."""
-    existence_probability: float
 
 
 class Tracker:
@@ -132,10 +131,7 @@ class Tracker:
         displacement = None if own_velocity is None else interval_s * own_velocity
         known = [index for index, track in enumerate(self._tracks) if track.was_confirmed]
         later = imm.predicted(self._motions[known], interval_s, displacement, 0.0, self.parameters, self._braking_m_s2)
-        return tuple(
-            Prediction(mean[:3], math.exp(mean[6]), track.drone_probability * self._survives(track, interval_s))
-            for track, mean in zip([self._tracks[index] for index in known], later.together.mean[:, 0], strict=True)
-        )
+        return tuple(Prediction(mean[:3], math.exp(mean[6])) for mean in later.together.mean[:, 0])
 
     def resize(self, size_m: float, own_velocity: FloatArray | None) -> None:
         """Rescales all neighbours to `size_m`, from tip to tip, and their ranges by the same factor.

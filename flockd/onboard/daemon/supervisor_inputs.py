@@ -168,11 +168,12 @@ class CameraMonitor:
         frozen = camera.counts.get("frozen", 0)
         if camera.fault is None:
             self._frozen_before[name] = frozen
-        is_frozen = camera.fault is not None and frozen > self._frozen_before[name]
-        unplugged = camera.fault is not None and not is_frozen
-        period_s = self._periods_s[name]
-        noisy = now - self._clean_s.setdefault(name, now) > self._timeout_periods * period_s
-        return CameraHealth(camera.age_s, period_s, unplugged=unplugged, frozen=is_frozen, noisy=noisy)
+        period_s, fault = self._periods_s[name], None
+        if now - self._clean_s.setdefault(name, now) > self._timeout_periods * period_s:
+            fault = "noisy"
+        if camera.fault is not None:
+            fault = "frozen" if frozen > self._frozen_before[name] else "unplugged"
+        return CameraHealth(camera.age_s, period_s, fault)
 
 
 def _tally(status: Mapping[str, CameraStatus], noisy_images: int) -> _Tally:

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from flockd.core.messages import FloatArray, PilotOutput
-from flockd.flight.mission.circle_then_tangent import desired_of
 from flockd.flight.pilot import FlockPilot, StepTrace
 from flockd.onboard.message_json import from_json, to_json
 from flockd.onboard.recording import RecordingError
@@ -69,9 +68,8 @@ def flight_log(recordings: Sequence[Recording], progress: Progress = lambda done
         if step.truth is not None:
             _add_truth(builder, row, step.truth, companion)
         if began_s is not None and step.outputs:
-            elapsed_s, statuses = step.time_s - began_s, [output.mission for _, output in step.outputs]
-            mission = recordings[0].config.mission
-            builder.add_missions(row, np.array([desired_of(mission, elapsed_s, s) for s in statuses]), statuses)
+            statuses = [output.mission for _, output in step.outputs]
+            builder.add_missions(row, np.array([status.desired for status in statuses]), statuses)
         for drone, output in step.outputs:
             builder.add_output(row, drone, output, output.stages_ms)
     metadata = _metadata(recordings, names, steps[-1].time_s - steps[0].time_s, zero_s)

@@ -75,8 +75,8 @@ _HOLD_BRAKING_M_S2 = 3.0
 """Deceleration to the place where it holds, once it answers: PX4's default of MPC_ACC_HOR."""
 
 
-_SEES = CameraHealth(age_s=0.0, period_s=1.0, unplugged=False, frozen=False, noisy=False)
-_LOST = replace(_SEES, unplugged=True)
+_SEES = CameraHealth(age_s=0.0, period_s=1.0, fault=None)
+_LOST = replace(_SEES, fault="unplugged")
 _WELL = Inputs(
     cameras={"one": _SEES}, dropped_share=0.0, estimate_age_s=0.0, ego_motion_age_s=0.0, network_faults=0,
     inference_stuck=False, load=0.0, temperature_c=None, loop_lag_s=0.0, velocity_late_s=0.0, velocity_error_m_s=0.0,

@@ -13,7 +13,6 @@ import numpy as np
 from flockd import __version__
 from flockd.core.choices import SimulatedPerception
 from flockd.core.messages import FloatArray, FrameSet, MissionOrder, PilotOutput, VehicleState
-from flockd.flight.mission.circle_then_tangent import desired_of
 from flockd.flight.perception import Networks, load_networks
 from flockd.flight.pilot import FlockPilot, StepTrace
 from flockd.onboard.recording import Recorder
@@ -290,7 +289,7 @@ class VisionPilots:
             commands.height_m[i] = np.nan if command.height_m is None else command.height_m
             commands.missions[i], commands.obstacles[i] = output.mission, output.obstacles
             commands.seen_m[i], commands.neighbours[i] = output.seen_m, output.neighbours
-            commands.desired[i] = desired_of(self._scenario.drone_of(i).mission, time_s, output.mission)
+            commands.desired[i] = output.mission.desired
         for i, hand in self._hands.items():
             commands.missions[i] = fly_by_hand(hand, i, time_s, vehicles.position[i, :2], commands)
             commands.yaw_rad[i] = self._yaw_rad

@@ -11,8 +11,7 @@ import numpy as np
 
 from flockd import __version__
 from flockd.core.config import DroneConfig
-from flockd.core.messages import NO_STATUS, FloatArray, MissionStatus, PilotOutput
-from flockd.flight.mission.circle_then_tangent import desired_of
+from flockd.core.messages import NO_STATUS, MissionStatus, PilotOutput
 from flockd.onboard.message_json import from_json
 from flockd.onboard.recording.mcap_file import read_entries
 from flockd.onboard.recording.streams import OUTPUT
@@ -83,7 +82,7 @@ def fleet_log(
             statuses[row][i] = output.mission
             if output.mission.takeover is not None:
                 over.add(config.name)
-    _add_missions(builder, scenario, frames, times, statuses)
+    _add_missions(builder, scenario, frames, statuses)
     end = [frame for frame, time_s in zip(frames, times, strict=True) if time_s >= times[-1] - END_OF_FLIGHT_S]
     fleet = FleetMetadata(
         speed_factor=speed_factor,
@@ -115,25 +114,22 @@ def fleet_log(
 
 
 def _add_missions(
-    builder: FlightLogBuilder, scenario: ScenarioConfig, frames: Sequence[Poses], times: FloatArray,
+    builder: FlightLogBuilder,
+    scenario: ScenarioConfig,
+    frames: Sequence[Poses],
     statuses: Sequence[Mapping[int, MissionStatus]],
-) -> None:  # fmt: skip
+) -> None:
     """What each drone wanted at each frame; where its pilot left one out, what it wanted before.
 
     Of one that is flown by hand nobody knows more than how it flew.
     """
     vehicles = range(len(scenario.vehicles))
     homes = np.array([vehicle.position_m[:2] for vehicle in scenario.vehicles])
-    missions = [scenario.drone_of(i).mission for i in vehicles]
     newest: dict[int, MissionStatus] = {}
     for row, (frame, found) in enumerate(zip(frames, statuses, strict=True)):
         newest |= found
         desired = [
-            frame.velocity[i, :2]
-            if scenario.vehicles[i].by_hand
-            else desired_of(missions[i], float(times[row]), newest[i])
-            if i in newest
-            else np.zeros(2)
+            frame.velocity[i, :2] if scenario.vehicles[i].by_hand else newest.get(i, NO_STATUS).desired
             for i in vehicles
         ]
         builder.add_missions(row, np.array(desired), [newest.get(i, NO_STATUS) for i in vehicles], homes)

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from flockd.core.config.flocking import WeightParameters
 from flockd.core.config.mission import MissionParameters
-from flockd.flight.flocking import FlockingLaw, FlockingParameters, level_offsets
+from flockd.flight.flocking import FlockingLaw, FlockingParameters
+from flockd.flight.flocking.law import level_offsets
 from flockd.flight.mission.circle_then_tangent import course, desired_velocity
 from flockd.review.metrics import min_distance, obj1, obj2, pair_distances
 

@@ -17,8 +17,8 @@ from flockd.core.errors import ModelError
 from flockd.core.messages import FloatArray, Frame, UInt8Array
 from flockd.flight.inference import OnnxModel, find_manifests, load_manifest
 from flockd.flight.inference.manifest_file import read_manifest
-from flockd.flight.perception import Crop, DisFlow, OnnxNetworks
-from flockd.flight.perception.flow import OnnxFlow, grid_flow
+from flockd.flight.perception import Crop, OnnxNetworks
+from flockd.flight.perception.flow import DisFlow, OnnxFlow, grid_flow
 from flockd.flight.perception.interface import RangeEstimates
 from tests.flight.perception.cameras import crop_of, rendered
 from tests.make import rig_camera

@@ -16,7 +16,6 @@ from flockd.core.config.safety import GateParameters
 from flockd.core.messages import Detection, FloatArray, FrameSet, LearnedSize, Neighbour, PilotOutput, VehicleState
 from flockd.flight.geometry import log_polar_covariance
 from flockd.flight.perception import Observation
-from flockd.flight.perception.interface import KnownSize
 from flockd.flight.pilot import FlockPilot
 from flockd.flight.pilot.size_learner import DURATION_S, PERIOD_S, Weave, scale_of
 from tests.make import changed, frames, neighbour, scenario, vehicle
@@ -45,11 +44,11 @@ class Flight:
         self.below_m = self.time_s = 0.0
         self._drift: FloatArray = np.zeros_like(PLACES)
         self._last: Observation | None = None
-        self.told: list[KnownSize | None] = []
+        self.told: list[LearnedSize | None] = []
 
     def observe(
         self, frames: FrameSet, vehicle: VehicleState, ground: Any, predictions: Any, trace: Any, lap: Any,
-        learned_size: KnownSize | None,
+        learned_size: LearnedSize | None,
     ) -> Observation:  # fmt: skip
         """Four drones, at the range at which one of the size that it goes by has their apparent size."""
         self.told.append(learned_size)
@@ -121,7 +120,7 @@ def test_a_size_that_is_a_quarter_off_is_found_within_a_weave_and_errs_as_it_say
         found = next(k for k, one in enumerate(outputs) if one.size and one.size.size_m)
         shrunk = np.array(ranges(outputs[found])) / ranges(outputs[found - 1])
         assert np.median(shrunk) == pytest.approx(flight.learned.size_m / JUDGED_M, abs=0.08)
-        assert flight.told[-1] == KnownSize(flight.learned.size_m, flight.learned.sigma * flight.learned.size_m)
+        assert flight.told[-1] == flight.learned
         assert min(range_sigmas(outputs[-1])) >= flight.learned.sigma
         assert f"{flight.learned.size_m:.2f} m large" in outputs[-1].mission.sentence
         assert sum(now and not before for before, now in itertools.pairwise([False, *weaves(outputs)])) == 1
@@ -148,7 +147,7 @@ def test_what_a_flight_learned_the_next_one_begins_with() -> None:
     learned = LearnedSize(SIZE_M, 0.05)
     flight = Flight(drone(), learned=learned)
     outputs = flight.fly(25.0)
-    assert flight.told[0] == KnownSize(SIZE_M, 0.05 * SIZE_M)
+    assert flight.told[0] == LearnedSize(SIZE_M, 0.05)
     assert not any(weaves(outputs))
     assert flight.learned == learned
     assert Flight(drone("off"), learned=learned).learned is None

@@ -32,7 +32,7 @@ STEP_S = 1 / 16
 QUIET = quiet()
 ALL_SEE = QUIET.cameras
 SEES = ALL_SEE["front"]
-UNPLUGGED = replace(SEES, unplugged=True)
+UNPLUGGED = replace(SEES, fault="unplugged")
 ONE_LOST = {**ALL_SEE, "back": UNPLUGGED}
 NONE_SEE = dict.fromkeys(ALL_SEE, UNPLUGGED)
 STATE_OF = {
@@ -525,9 +525,9 @@ def test_so_many_cameras_may_be_lost(lost: tuple[str, ...], limit: int, event: E
 def test_the_reason_names_the_cameras_and_their_faults_and_without_any_nothing_is_seen() -> None:
     cameras = {
         "front": UNPLUGGED,
-        "right": replace(SEES, frozen=True),
+        "right": replace(SEES, fault="frozen"),
         "back": replace(SEES, age_s=0.2),
-        "left": replace(SEES, noisy=True),
+        "left": replace(SEES, fault="noisy"),
         "top": SEES,
     }
     for event, limit in ((Event.SIGHT_LOST, 1), (Event.CAMERA_LOST, 4)):
@@ -646,8 +646,7 @@ def _changes(random: Random) -> dict[str, Any]:
             case 4:
                 changes["flight_mode"] = random.choice((OFFBOARD, "hold", "", None))
             case 5:
-                flags = [random.random() < 0.5 for _ in range(3)]
-                one = CameraHealth(any_float(random), any_float(random), *flags)
+                one = CameraHealth(any_float(random), any_float(random), random.choice(("frozen", "noisy", None)))
                 changes["cameras"] = {} if random.random() < 0.1 else {"front": one, "back": one}
             case 6:
                 changes |= {"armed": False, "in_air": False, "resume_asked": random.random() < 0.5}

@@ -199,9 +199,10 @@ def test_a_prediction_is_where_the_flock_mate_flies_to() -> None:
     (prediction,) = flock.tracker.predictions(1.0, CRUISE)
     np.testing.assert_allclose(prediction.position, now + 0.2 * CRUISE, atol=0.03)
     assert prediction.size_m == pytest.approx(0.6, rel=1e-5)
-    assert prediction.existence_probability == pytest.approx(math.exp(-1.0 / 60.0), abs=1e-3)
     (still,) = flock.tracker.predictions(1.0, None)
     np.testing.assert_allclose(still.position, now, atol=0.03)
+    flock.tracker.predict(1.0, CRUISE)
+    assert flock.tracker.neighbours()[0].existence_probability == pytest.approx(math.exp(-1.0 / 60.0), abs=1e-3)
 
 
 def test_a_single_detection_is_dropped_after_two_misses_and_two_survive_one_miss() -> None:

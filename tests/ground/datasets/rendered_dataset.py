@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from flockd.core.messages import Float32Array, FloatArray, Frame, UInt8Array
 from flockd.flight.geometry import RigCamera, ZMap
-from flockd.flight.perception import Crop, DisFlow, OneByOne, RangeEstimates, SceneMaps
+from flockd.flight.perception import Crop, OneByOne, RangeEstimates, SceneMaps
+from flockd.flight.perception.flow import DisFlow
 from flockd.sim.renderer.renderer import Renderer
 from flockd.sim.world.world import World
 from tests.flight.perception.cameras import SECOND_STAGE

@@ -9,13 +9,13 @@ import cv2
 import numpy as np
 
 from flockd.core.config.perception import DetectionParameters
-from flockd.core.messages import UNCLASSED, Detection, Reason, UInt8Array, VehicleState
+from flockd.core.messages import UNCLASSED, Detection, LearnedSize, Reason, UInt8Array, VehicleState
 from flockd.flight.geometry import Rig
 from flockd.flight.perception.detection.instances import Instance
 from flockd.flight.perception.detection.nms import suppress
 from flockd.flight.perception.detection.proposals import Proposal, propose_instances, propose_predictions
 from flockd.flight.perception.detection.refinement import Candidate, Cascade
-from flockd.flight.perception.interface import KnownSize, Networks, SceneMaps
+from flockd.flight.perception.interface import Networks, SceneMaps
 from flockd.flight.tracking import Prediction
 
 
@@ -51,7 +51,7 @@ class Detector:
         vehicle: VehicleState,
         predictions: Sequence[Prediction],
         trace: DetectionTrace,
-        known_size: KnownSize | None,
+        known_size: LearnedSize | None,
     ) -> Detected:
         """The drones in view, and their masks.
 
@@ -97,11 +97,7 @@ def first_stage_labels(scene: SceneMaps, label_of: Mapping[int, int], rejected: 
     for instance in scene.instances:
         otherwise = 0 if instance in rejected else UNCLASSED
         table[instance.label] = label_of.get(instance.label, otherwise)
-    labels = np.zeros_like(scene.labels)
-    left, top, width, height = cv2.boundingRect(scene.labels)  # the smallest part with all labels: they are few
-    part = np.s_[top : top + max(height, 1), left : left + max(width, 1)]
-    labels[part] = cv2.LUT(scene.labels[part], table)
-    return labels
+    return np.asarray(cv2.LUT(scene.labels, table), np.uint8)
 
 
 def without_borders(labels: UInt8Array, border_px: int) -> UInt8Array:

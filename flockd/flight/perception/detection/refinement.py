@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockd.core.config.perception import DetectionParameters
-from flockd.core.messages import BoolArray, FloatArray, IntArray, Reason, ReasonKind, UInt8Array
+from flockd.core.messages import BoolArray, FloatArray, IntArray, LearnedSize, Reason, ReasonKind, UInt8Array
 from flockd.flight.geometry import Rig, log_polar_covariance, virtual_crops
 from flockd.flight.perception.detection.proposals import Proposal, angles_between, pixel_angles
-from flockd.flight.perception.interface import Crop, KnownSize, Networks, RangeEstimates
+from flockd.flight.perception.interface import Crop, Networks, RangeEstimates
 
 LIKELY = 0.5
 """A proposal that is likelier a drone than not is a candidate: the tracker weighs the probability."""
@@ -71,7 +71,7 @@ class Estimates(NamedTuple):
         """Those at these indices, or of this mask."""
         return Estimates(*(column[which] for column in self))
 
-    def of_size(self, known: KnownSize) -> Estimates:
+    def of_size(self, known: LearnedSize) -> Estimates:
         """The ranges at which drones of the known size have these apparent sizes.
 
         The error of the apparent size stays; the known size's sigma replaces that of the estimated one.
@@ -81,7 +81,7 @@ class Estimates(NamedTuple):
         return self._replace(
             log_range=math.log(known.size_m) - (log_judged - self.log_range),
             size_m=np.full_like(self.size_m, known.size_m),
-            log_size_sigma=np.full_like(self.size_m, known.sigma_m / known.size_m),
+            log_size_sigma=np.full_like(self.size_m, known.sigma),
         )
 
     def mean(self, other: Estimates) -> Estimates:
@@ -119,7 +119,7 @@ class Cascade:
         self,
         network: Networks,
         parameters: DetectionParameters,
-        known_size: KnownSize | None,
+        known_size: LearnedSize | None,
         rig: Rig,
         images: Mapping[str, UInt8Array],
     ) -> None:

@@ -10,9 +10,9 @@ import pytest
 from flockd.core.config.perception import DetectionParameters
 from flockd.core.messages import Float32Array, FloatArray, UInt8Array
 from flockd.flight.geometry import Rig, RigCamera, WideAngleCamera, ZMap
-from flockd.flight.perception import SceneMaps, group_instances
+from flockd.flight.perception import SceneMaps
 from flockd.flight.perception.detection.boxes import BoxRules, kept_boxes, probable_boxes, with_boxes
-from flockd.flight.perception.detection.instances import Instance
+from flockd.flight.perception.detection.instances import Instance, group_instances
 from flockd.flight.perception.detection.proposals import (
     Proposal,
     proposals_of_instances,
@@ -71,7 +71,7 @@ def test_a_neighbour_is_searched_for_though_another_range_is_detected_there(rang
     front = Rig({"front": CAMERA})
     ahead = CAMERA.T_body_camera.rotation @ [0.0, 0.0, 1.0]
     beside = CAMERA.T_body_camera.rotation @ [math.sin(math.radians(2.0)), 0.0, math.cos(math.radians(2.0))]
-    near = Prediction(3.0 * ahead, 0.5, 0.99)
+    near = Prediction(3.0 * ahead, 0.5)
     found, _ = propose_predictions(front, vehicle(), [near], [(beside, math.log(range_m))], RULES)
     assert len(found) == searched
 

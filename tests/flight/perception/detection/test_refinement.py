@@ -11,14 +11,13 @@ import pytest
 from pydantic import ValidationError
 
 from flockd.core.config.perception import DetectionParameters, PerceptionConfig
-from flockd.core.messages import FloatArray
+from flockd.core.messages import FloatArray, LearnedSize
 from flockd.flight.geometry import log_polar
 from flockd.flight.perception import Crop, Perception, RangeEstimates
 from flockd.flight.perception.detection.instances import Instance
 from flockd.flight.perception.detection.nms import fuse, suppress
 from flockd.flight.perception.detection.proposals import Proposal
 from flockd.flight.perception.detection.refinement import Candidate, Estimates
-from flockd.flight.perception.interface import KnownSize
 from tests.flight.pilot.flyer import Flyer, scenario_with
 
 
@@ -110,7 +109,7 @@ def test_range_is_size_over_apparent_size() -> None:
     judged = np.array([0.8, 0.0, math.inf, math.nan])
     log_range, sigma, probability = (np.full(4, value) for value in (math.log(4.0), 0.03, 0.9))
     estimates = Estimates(np.tile([1.0, 0.0, 0.0], (4, 1)), log_range, sigma, judged, probability, np.full(4, 0.3))
-    known = estimates.of_size(KnownSize(0.5, 0.02))
+    known = estimates.of_size(LearnedSize(0.5, 0.04))
     assert np.exp(known.log_range) == pytest.approx([2.5, math.nan, math.nan, math.nan], nan_ok=True)
     assert (known.log_range_sigma[0], known.log_size_sigma[0]) == pytest.approx((0.03, 0.04))
     assert (known.size_m[0], known.drone_probability[0], known.bearing[0, 0]) == (0.5, 0.9, 1.0)
