@@ -185,7 +185,7 @@ class MissionStatus:
 
 
 NO_STATUS = MissionStatus("unknown", np.zeros(2), "has not begun")
-"""The status before a pilot's first valid step, and in recordings that do not contain the circle's."""
+"""The status before a pilot's first valid step."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 
 from flockd.core.messages import BoolArray, Float32Array, FloatArray, IntArray, UInt8Array
-from flockd.flight.geometry.cameras import PinholeCamera
 from flockd.flight.geometry.pairs import grid_pixels
 from flockd.flight.geometry.rig import Rig, RigCamera
 
@@ -65,43 +64,7 @@ class VirtualCrops:
         (n,), the ranges of the targets, other cameras are sampled at those ranges, which corrects their parallax;
         without, or if NaN, at infinity.
         """
-        drawn = np.full((len(self.main), self.size_px, self.size_px, 3), _GREY, np.uint8)
-        valid = np.zeros(drawn.shape[:3], np.bool_)
-        for index, camera in self._with(images):
-            if index in self.main:
-                mine = (self.main == index).nonzero()[0]
-                crops = self.take(mine)
-                homographies, whole = crops._homographies(camera)
-                factors = crops._minification(camera).tolist()
-                for k in whole.nonzero()[0].tolist():
-                    u, v, z = homographies[k] @ _pixels(self.size_px)
-                    where = np.array([u / z, v / z], np.float32).reshape(2, self.size_px, self.size_px)
-                    drawn[mine[k]] = _draw(images[camera.name], where, factors[k])
-                valid[mine[whole]] = True
-        rest = (~valid[:, 0, 0]).nonzero()[0]
-        if len(rest):
-            ranges = np.full(len(rest), np.nan) if range_m is None else range_m[rest]
-            drawn[rest], valid[rest] = self.take(rest)._sample_by_pixel(images, ranges)
-        return drawn, valid
-
-    def _homographies(self, camera: RigCamera) -> tuple[FloatArray, BoolArray]:
-        """(n, 3, 3) from the crops' pixels to a camera's, and a mask (n,) of the crops that they draw whole.
-
-        They suit most crops, and take half the time: for a pinhole without distortion with all their corners in its
-        image.
-        """
-        if not isinstance(camera.camera, PinholeCamera) or camera.camera.distortion:
-            return np.empty((len(self.main), 3, 3)), np.zeros(len(self.main), np.bool_)
-        homographies = camera.camera.matrix @ camera.T_body_camera.rotation.T @ self._to_body
-        u, v, z = (homographies @ _pixels(self.size_px)[:, [0, self.size_px - 1, -self.size_px, -1]]).swapaxes(0, 1)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            corners = np.stack([u / z, v / z], 2)
-        inside = camera.camera.in_image(corners.reshape(-1, 2)).reshape(z.shape)
-        return homographies, np.asarray((inside & (z > 0.0)).all(1))
-
-    def _sample_by_pixel(self, images: Mapping[str, UInt8Array], range_m: FloatArray) -> tuple[UInt8Array, BoolArray]:
-        """As `sample`, for any camera."""
-        source, where = self._sources(images, range_m)
+        source, where = self._sources(images, np.full(len(self.main), np.nan) if range_m is None else range_m)
         drawn = np.full((*source.shape, 3), _GREY, np.uint8)
         for index, camera in self._with(images):
             mine = source == index
@@ -119,21 +82,17 @@ class VirtualCrops:
     def _with(self, images: Mapping[str, UInt8Array]) -> list[tuple[int, RigCamera]]:
         return [(index, one) for index, one in enumerate(self.rig.cameras.values()) if one.name in images]
 
-    @property
-    def _to_body(self) -> FloatArray:
-        """(n, 3, 3) from pixels to directions in the body, not of unit length."""
-        to_virtual = np.zeros((len(self.main), 3, 3))
-        to_virtual[:, [0, 1], [0, 1]] = 1.0 / self.focal_px[:, None]
-        to_virtual[:, :2, 2] = -self.size_px / 2 / self.focal_px[:, None]
-        to_virtual[:, 2, 2] = 1.0
-        return self.R_body_virtual @ to_virtual
-
     def _sources(self, images: Mapping[str, UInt8Array], range_m: FloatArray) -> tuple[IntArray, Float32Array]:
         """For each pixel (n, size^2) the index of the camera that shows it, and u and v (2, n, size^2) there; -1 and
         NaN if none does."""
         pixels = _pixels(self.size_px)
+        to_virtual = np.zeros((len(self.main), 3, 3))
+        to_virtual[:, [0, 1], [0, 1]] = 1.0 / self.focal_px[:, None]
+        to_virtual[:, :2, 2] = -self.size_px / 2 / self.focal_px[:, None]
+        to_virtual[:, 2, 2] = 1.0
+        to_body = self.R_body_virtual @ to_virtual
         # One contiguous array for each coordinate.
-        towards = (self._to_body.transpose(1, 0, 2).reshape(-1, 3) @ pixels).reshape(3, len(self.main), -1)
+        towards = (to_body.transpose(1, 0, 2).reshape(-1, 3) @ pixels).reshape(3, len(self.main), -1)
         where = np.full((2, *towards.shape[1:]), np.nan, np.float32)
         for index, camera in self._with(images):
             if index in self.main:

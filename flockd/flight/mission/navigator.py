@@ -14,7 +14,6 @@ from flockd.core.navigation import wrapped
 from flockd.flight.geometry import Rig
 from flockd.flight.mission.circle_then_tangent import CircleThenTangent
 from flockd.flight.mission.guidance import Guidance, Mission, Moment, course_of
-from flockd.flight.mission.operator import Operator
 from flockd.flight.mission.velocity import Velocity
 from flockd.flight.mission.waypoints import Waypoints
 from flockd.flight.obstacles import AZIMUTHS, in_view
@@ -33,18 +32,22 @@ class Navigator:
         self._parameters = parameters
         self._mission = _mission(parameters, gate)
         self._began_s = 0.0
+        self._lapses = False
+        """Whether the mission ends `timeout_s` after it began."""
         self._height_m = parameters.height_m
         """The last height of the mission or an order, without offset; kept until there is another."""
         self._course_rad: float | None = None
         self._turned_s = 0.0
 
     def step(self, moment: Moment) -> Guidance:
-        """The mission's guidance, `moment.time_s` after the flight began; an order may replace the mission.
+        """The mission's guidance, `moment.time_s` after the flight began; an order replaces the mission.
 
         The configured offset is added to its height, and its course turns no faster than `MAX_TURN_RAD_S`.
         """
-        if moment.order is not None and self._configured.kind != "operator":
+        if moment.order is not None:
             self._replace(moment.order, moment.time_s)
+        if self._lapses and moment.time_s - self._began_s >= self._configured.timeout_s:
+            self._mission = Velocity((0.0, 0.0), _SENTENCES["operator"])
         guidance = self._mission.step(replace(moment, time_s=moment.time_s - self._began_s))
         if guidance.height_m is not None:
             self._height_m = guidance.height_m
@@ -74,10 +77,16 @@ class Navigator:
         )
 
     def _replace(self, order: MissionOrder, time_s: float) -> None:
-        """Begins an order's mission: a goal without time limit, or an operator's velocity for some seconds."""
-        self._parameters = ordered_mission(self._configured, order)
-        self._mission = _mission(self._parameters, self._gate)
-        self._began_s = time_s
+        """Begins an order's mission: a velocity lapses after some seconds; a goal does so in an operator's mission."""
+        ordered, by_operator = ordered_mission(self._configured, order), self._configured.kind == "operator"
+        if not by_operator:
+            self._parameters = ordered
+        if order.velocity is None:
+            self._mission = Waypoints(ordered, self._gate)
+        else:
+            self._mission = Velocity(order.velocity.tolist(), "flies an operator's velocity")
+            self._height_m = self._height_m if order.height_m is None else order.height_m
+        self._began_s, self._lapses = time_s, by_operator or order.velocity is not None
 
     def _turned(self, wanted_rad: float | None, time_s: float) -> float | None:
         """The course after turning from the last one at the largest turn rate."""
@@ -141,14 +150,16 @@ def _mission(parameters: MissionParameters, gate: GateParameters) -> Mission:
     match parameters.kind:
         case "circle_then_tangent":
             return CircleThenTangent(parameters)
-        case "hover":
-            return Velocity((0.0, 0.0), "hovers")
-        case "velocity":
-            assert parameters.velocity_m_s is not None  # checked by MissionParameters
-            return Velocity(parameters.velocity_m_s, "flies at its velocity")
         case "waypoints":
             return Waypoints(parameters, gate)
-        case "follow":
-            return Velocity((0.0, 0.0), "follows the flock")
-        case "operator":
-            return Operator(parameters)
+        case kind:
+            return Velocity(parameters.velocity_m_s or (0.0, 0.0), _SENTENCES[kind])
+
+
+_SENTENCES = {
+    "hover": "hovers",
+    "velocity": "flies at its velocity",
+    "follow": "follows the flock",
+    "operator": "hovers until an operator's next order",
+}
+"""What a drone with a constant velocity does, by the kind of its mission."""

@@ -11,7 +11,7 @@ from flockd.core.config.drone import DroneConfig
 from flockd.core.config.mission import fault_of_height, fault_of_place, fault_of_speed
 from flockd.core.messages import FloatArray, MissionOrder, VehicleState
 from flockd.flight.mission.navigator import ordered_mission
-from flockd.flight.mission.places import place_of_order
+from flockd.flight.mission.waypoints import place_of_waypoint
 
 
 def order_fault(config: DroneConfig, order: MissionOrder, vehicle: VehicleState | None) -> str | None:
@@ -39,15 +39,15 @@ def order_fault(config: DroneConfig, order: MissionOrder, vehicle: VehicleState 
         return "the drone does not know where it is: the autopilot has not sent its position"
     if order.velocity is not None:
         return _fault_of_velocity(config, vehicle.position, order.velocity)
-    goal = place_of_order(order, np.array(mission.origin_m), vehicle.home_deg)
+    try:
+        (waypoint,) = ordered_mission(mission, order).waypoints
+    except ValidationError:  # only the goal is not checked above
+        return "the goal is farther than any mission leads; name one nearer to home"
+    goal = place_of_waypoint(waypoint, np.array(mission.origin_m), vehicle.home_deg)
     if goal is None:
         return "the drone does not know its home in degrees; name the goal in metres from there"
     if (fault := fault_of_place(gate, float(goal[0]), float(goal[1]))) is not None:
         return f"the goal {fault}"
-    try:
-        ordered_mission(mission, order)
-    except ValidationError:  # only the goal is not checked above
-        return "the goal is farther than any mission leads; name one nearer to home"
     return None
 
 

@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 
-from flockd.core.config.mission import MissionParameters, fault_of_place
+from flockd.core.config.mission import MissionParameters, WaypointParameters, fault_of_place
 from flockd.core.config.safety import GateParameters
 from flockd.core.messages import FloatArray
+from flockd.core.navigation import metres_from
 from flockd.flight.mission.guidance import Guidance, Moment, course_of, towards
-from flockd.flight.mission.places import place_of_waypoint
 
 PATIENCE_S = 5.0
 """A waypoint within this flight time counts as reached if the flock has come no nearer for the same time."""
@@ -118,3 +118,15 @@ class _Approach:
             self._nearest_m, self._since_s = away_m, time_s
         moved, near = self._nearest_m < self._first_m, self._nearest_m <= reached_m + reach_m
         return moved and near and time_s - self._since_s >= PATIENCE_S
+
+
+def place_of_waypoint(
+    waypoint: WaypointParameters, origin: FloatArray, home_deg: FloatArray | None
+) -> FloatArray | None:
+    """(2,) metres north and east of home; None: the waypoint is in degrees and home is not known."""
+    if waypoint.north_m is not None and waypoint.east_m is not None:
+        place: FloatArray = origin + np.array([waypoint.north_m, waypoint.east_m])
+        return place
+    assert waypoint.latitude_deg is not None and waypoint.longitude_deg is not None  # checked by WaypointParameters
+    place_deg = waypoint.latitude_deg, waypoint.longitude_deg
+    return None if home_deg is None else np.array(metres_from(home_deg.tolist(), place_deg))

@@ -13,7 +13,15 @@ import pytest
 
 from flockd.cli import main
 from flockd.core.config import DroneConfig
-from flockd.core.messages import EgoMotion, FrameSet, LearnedSize, MissionOrder, PilotOutput, VehicleState
+from flockd.core.messages import (
+    EgoMotion,
+    FrameSet,
+    LearnedSize,
+    MissionOrder,
+    MissionStatus,
+    PilotOutput,
+    VehicleState,
+)
 from flockd.flight.geometry import RangeMap
 from flockd.flight.perception import Observation
 from flockd.flight.perception.observation import CameraObservation
@@ -65,6 +73,8 @@ def output_of(drone: int, step: int, time_s: float) -> PilotOutput:
     known = make.neighbour((0.0, east_m, 0.0), (1.0, 0.0, 0.0), track=7)
     false = replace(known, track=9, position=np.array([-20.0, 0.0, 0.0]))
     neighbours = [known] * (step >= UNKNOWN_STEPS) + [false] * (drone == 0 and step == 5)
+    course_rad = STEP_S * step / 10.0  # Eq. 43 with the defaults: 1 m/s around a circle of 10 m
+    desired = np.array([np.cos(course_rad), np.sin(course_rad)])
     moved = EgoMotion(np.eye(3), np.array([STEP_S + LONG_M, 0.0, 0.0]), STEP_S, 100, 80, 0.1)
     return make.output(
         time_s,
@@ -75,6 +85,7 @@ def output_of(drone: int, step: int, time_s: float) -> PilotOutput:
         neighbours=tuple(neighbours),
         command=make.wanted((1.0, 0.1)),
         stages_ms={"scene": 10.0 + step},
+        mission=MissionStatus("circle_then_tangent", desired, "on the circle"),
     )
 
 
@@ -153,7 +164,6 @@ def test_a_flights_recordings_are_judged_by_the_truth_in_them(flight: Path) -> N
     assert summary["neighbours"]["false_per_drone_minute"] == pytest.approx(1 / (2 * STEPS * STEP_S / 60))
     assert summary["stages_ms"]["scene"]["p50"] == pytest.approx(10 + (STEPS - 1) / 2)
     np.testing.assert_allclose(np.linalg.norm(log.truth_position[:, 0] - log.truth_position[:, 1], axis=1), COMPANION_M)
-    # Eq. 43 with the defaults: 1 m/s around a circle of 10 m.
     np.testing.assert_allclose(np.arctan2(log.desired[:, 1], log.desired[:, 0]), log.time_s / 10)
 
 
