@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import importlib.util
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,7 +14,7 @@ import onnxruntime as ort
 from flockd.core.choices import Provider
 from flockd.core.config.perception import PerceptionConfig
 from flockd.core.errors import ModelError, UnavailableError, shortage_of
-from flockd.flight.inference.manifest import Manifest
+from flockd.flight.inference.manifest import InputSpec, Manifest, OutputSpec, listed
 from flockd.flight.inference.manifest_file import ManifestFile, models_folder
 from flockd.flight.inference.runtimes import OnnxRuntime, OpenVino, Runtime
 
@@ -77,7 +77,7 @@ def open_runtime(file: ManifestFile, *, threads: int, provider: Provider, folder
     try:
         if provider == "openvino":
             return OpenVino(file.model, threads, folder)
-        runtime = OnnxRuntime(_session(file, threads, provider, folder))
+        session = _session(file, threads, provider, folder)
     except Exception as error:  # noqa: BLE001 - the libraries' own exception types are private
         if (lacking := shortage_of(error)) is not None:
             raise UnavailableError(f"{file.model} cannot be loaded: out of {lacking}; raise the limits") from None
@@ -90,13 +90,49 @@ def open_runtime(file: ManifestFile, *, threads: int, provider: Provider, folder
             f"{file.model} cannot be loaded by {name} ({reason}); fix what it says, or write perception.provider: cpu",
         ) from None
     # If a provider's libraries do not load, ONNX Runtime only warns and uses the CPU.
-    wanted = EXECUTION_PROVIDERS[provider]
+    runtime, wanted = OnnxRuntime(session), EXECUTION_PROVIDERS[provider]
     if runtime.provider != wanted:
         raise ModelError(
             f"perception.provider: {wanted} does not start here, and ONNX Runtime took {runtime.provider} in its "
             f"place; install the libraries that {provider} needs, or write cpu"
         )
+    _check_tensors(file, session)
     return runtime
+
+
+def _check_tensors(file: ManifestFile, session: ort.InferenceSession) -> None:
+    """Raises ModelError if the ONNX file's inputs and outputs differ from the manifest's.
+
+    In OpenVINO, which compiles a model for the shapes that it gets, the golden input shows it.
+    """
+    specs_of: tuple[tuple[str, Mapping[str, InputSpec | OutputSpec], Sequence[ort.NodeArg]], ...] = (
+        ("inputs", file.manifest.inputs, session.get_inputs()),
+        ("outputs", file.manifest.outputs, session.get_outputs()),
+    )
+    for key, specs, tensors in specs_of:
+        found = {tensor.name: tensor for tensor in tensors}
+        unused = key == "inputs" and len(found) > len(specs)  # the model needs every input; outputs may be unused
+        if unused or not specs.keys() <= found.keys():
+            fault = f"the manifest names {sorted(specs)} but the model file has {sorted(found)}"
+            raise file.error((key,), f"{fault}; make them agree")
+        for name, spec in specs.items():
+            for what, here, there in _misfits(spec, found[name]):
+                fault = f"the manifest says {here} but the model file {there}"
+                raise file.error((key, name, what), f"{fault}; make them agree")
+
+
+def _misfits(spec: InputSpec | OutputSpec, tensor: ort.NodeArg) -> Iterator[tuple[str, str, str]]:
+    """What differs between a manifest's and a file's tensor. The manifest may fix a size that the file leaves free."""
+    dtype = {"tensor(float)": "float32"}.get(tensor.type, tensor.type.removeprefix("tensor(").removesuffix(")"))
+    if dtype != spec.dtype:
+        yield "dtype", spec.dtype, dtype
+    is_output, shape = isinstance(spec, OutputSpec), tensor.shape
+    fits = len(shape) == len(spec.shape) and all(
+        not isinstance(there, int) or here == there or (is_output and isinstance(here, str))
+        for here, there in zip(spec.shape, shape, strict=True)
+    )
+    if not fits and (shape or not is_output):  # exporters may leave out shapes of outputs
+        yield "shape", listed(spec.shape), listed(list(shape))
 
 
 def _session(file: ManifestFile, threads: int, provider: Provider, folder: Path | None) -> ort.InferenceSession:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -15,16 +14,7 @@ if TYPE_CHECKING:
     import openvino
 
 Arrays = Mapping[str, NDArray[Any]]
-_Shapes = tuple[tuple[int, ...], ...]
-"""Shapes of all inputs, in the model's order."""
-
-
-class Tensor(Protocol):
-    """An input or an output as ONNX Runtime describes it."""
-
-    name: str
-    type: str
-    shape: Sequence[int | str | None]
+_Shape = tuple[int, ...]
 
 
 class Runtime(Protocol):
@@ -32,8 +22,6 @@ class Runtime(Protocol):
 
     provider: str
     """The provider that computes it, as the library reports."""
-    inputs: Sequence[Tensor]
-    outputs: Sequence[Tensor]
 
     def run(self, names: Sequence[str], feeds: Arrays) -> list[NDArray[Any]]:
         """Returns the outputs of these names. Raises errors of the library."""
@@ -51,8 +39,6 @@ class OnnxRuntime:
         self._session = session
         self._running: set[ort.RunOptions] = set()
         self.provider = str(session.get_providers()[0])
-        self.inputs: Sequence[Tensor] = session.get_inputs()
-        self.outputs: Sequence[Tensor] = session.get_outputs()
 
     def run(self, names: Sequence[str], feeds: Arrays) -> list[NDArray[Any]]:
         """See `Runtime`."""
@@ -68,13 +54,6 @@ class OnnxRuntime:
         """See `Runtime`."""
         for options in tuple(self._running):
             options.terminate = True
-
-
-@dataclass
-class _Tensor:
-    name: str
-    type: str
-    shape: Sequence[int | str | None]
 
 
 class OpenVino:
@@ -96,14 +75,12 @@ class OpenVino:
         }
         if folder is not None:
             self._options["CACHE_DIR"] = str(folder)
-        self.inputs: Sequence[Tensor] = _tensors(self._model.inputs)
-        self.outputs: Sequence[Tensor] = _tensors(self._model.outputs)
-        self._idle: dict[_Shapes, list[openvino.InferRequest]] = {}
+        self._idle: dict[tuple[_Shape, ...], list[openvino.InferRequest]] = {}
         self._running: set[openvino.InferRequest] = set()
 
     def run(self, names: Sequence[str], feeds: Arrays) -> list[NDArray[Any]]:
         """See `Runtime`."""
-        with self._request(tuple(feeds[tensor.name].shape for tensor in self.inputs)) as request:
+        with self._request({name: array.shape for name, array in feeds.items()}) as request:
             request.start_async(dict(feeds), share_inputs=True)  # `infer` cannot be cancelled
             request.wait()
             return [request.get_tensor(name).data.copy() for name in names]
@@ -114,9 +91,9 @@ class OpenVino:
             request.cancel()
 
     @contextmanager
-    def _request(self, shapes: _Shapes) -> Iterator[openvino.InferRequest]:
+    def _request(self, shapes: Mapping[str, _Shape]) -> Iterator[openvino.InferRequest]:
         """A request that no other thread uses: each one computes one run at a time."""
-        idle = self._idle.setdefault(shapes, [])
+        idle = self._idle.setdefault(tuple(shapes.values()), [])
         try:
             request = idle.pop()
         except IndexError:  # all are in use
@@ -128,18 +105,7 @@ class OpenVino:
             self._running.discard(request)
             idle.append(request)
 
-    def _compiled(self, shapes: _Shapes) -> openvino.InferRequest:
+    def _compiled(self, shapes: Mapping[str, _Shape]) -> openvino.InferRequest:
         model = self._model.clone()
-        model.reshape({tensor.name: list(shape) for tensor, shape in zip(self.inputs, shapes, strict=True)})
+        model.reshape({name: list(shape) for name, shape in shapes.items()})
         return self._core.compile_model(model, "CPU", self._options).create_infer_request()
-
-
-def _tensors(ports: Sequence[Any]) -> tuple[_Tensor, ...]:
-    return tuple(
-        _Tensor(
-            port.any_name,
-            str(port.element_type.to_dtype()),
-            tuple(size.get_length() if size.is_static else None for size in port.partial_shape),
-        )
-        for port in ports
-    )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,6 @@ from flockd.core.errors import FlockdError, UnavailableError, shortage_of
 from flockd.core.messages import Float32Array, UInt8Array
 from flockd.flight.inference.feeds import golden_feeds, shapes_of
 from flockd.flight.inference.fitting import entering, leaving
-from flockd.flight.inference.manifest import InputSpec, OutputSpec, listed
 from flockd.flight.inference.manifest_file import ManifestFile, read_manifest
 from flockd.flight.inference.providers import (
     SLOW_TO_BUILD,
@@ -24,7 +23,6 @@ from flockd.flight.inference.providers import (
     open_runtime,
     provider_of,
 )
-from flockd.flight.inference.runtimes import Tensor
 
 _GOLDEN_TOLERANCE = 0.02
 """Largest difference of mean and deviation: providers round differently."""
@@ -87,7 +85,6 @@ class OnnxModel:
         if self.engines is not None:
             self.engines.mkdir(parents=True, exist_ok=True)
         self._runtime = open_runtime(file, threads=threads, provider=provider, folder=self.engines)
-        _check_tensors(file, self._runtime.inputs, self._runtime.outputs)
         self._check_golden(file, provider, deadline)
 
     @property
@@ -146,35 +143,6 @@ class OnnxModel:
                 said, wanted = ("mean {:.4g} and deviation {:.4g}".format(*pair) for pair in (found, expected))
                 difference = f"the golden input gives {said}, not {wanted}"
                 raise file.error(("outputs", name), f"{difference}; export the model and its manifest together")
-
-
-def _check_tensors(file: ManifestFile, inputs: Sequence[Tensor], outputs: Sequence[Tensor]) -> None:
-    """Raises ModelError if the ONNX file's inputs and outputs differ from the manifest's."""
-    manifest = file.manifest
-    for key, specs, tensors in (("inputs", manifest.inputs, inputs), ("outputs", manifest.outputs, outputs)):
-        found = {tensor.name: tensor for tensor in tensors}
-        unused = key == "inputs" and len(found) > len(specs)  # the model needs every input; outputs may be unused
-        if unused or not specs.keys() <= found.keys():
-            fault = f"the manifest names {sorted(specs)} but the model file has {sorted(found)}"
-            raise file.error((key,), f"{fault}; make them agree")
-        for name, spec in specs.items():
-            for what, here, there in _misfits(spec, found[name]):
-                fault = f"the manifest says {here} but the model file {there}"
-                raise file.error((key, name, what), f"{fault}; make them agree")
-
-
-def _misfits(spec: InputSpec | OutputSpec, tensor: Tensor) -> Iterator[tuple[str, str, str]]:
-    """What differs between a manifest's and a file's tensor. The manifest may fix a size that the file leaves free."""
-    dtype = {"tensor(float)": "float32"}.get(tensor.type, tensor.type.removeprefix("tensor(").removesuffix(")"))
-    if dtype != spec.dtype:
-        yield "dtype", spec.dtype, dtype
-    is_output, shape = isinstance(spec, OutputSpec), tensor.shape
-    fits = len(shape) == len(spec.shape) and all(
-        not isinstance(there, int) or here == there or (is_output and isinstance(here, str))
-        for here, there in zip(spec.shape, shape, strict=True)
-    )
-    if not fits and (shape or not is_output):  # exporters may leave out shapes of outputs
-        yield "shape", listed(spec.shape), listed(list(shape))
 
 
 def cannot_run(file: ManifestFile, provider: str, error: Exception) -> FlockdError:
