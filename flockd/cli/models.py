@@ -130,7 +130,7 @@ def _prepare_one(path: Path, config: DroneConfig) -> dict[str, Any]:
     """Runs a model on every shape of input that these cameras give it, keeps the engines, and opens it as in flight."""
     from flockd.flight.inference import OnnxModel
     from flockd.flight.inference.feeds import feeds_for, golden_feeds, shapes_of
-    from flockd.flight.inference.providers import BUILD_ENGINES, engines_folder
+    from flockd.flight.inference.providers import BUILD_ENGINES, Prepared, engines_folder
     from flockd.flight.perception.onnx import CROPS_PER_RUN
 
     wanted = config.perception
@@ -149,7 +149,8 @@ def _prepare_one(path: Path, config: DroneConfig) -> dict[str, Any]:
         ]
         for each in feeds:
             model.run(each)
-        model.keep_engines([shapes_of(each) for each in feeds])
+        if model.engines is not None:
+            Prepared([shapes_of(each) for each in feeds]).save(model.engines)
         del model  # some providers write their cache when a session ends
     prepared_s = time.perf_counter()
     engines = OnnxModel(path, **options).engines

@@ -9,6 +9,7 @@ from functools import lru_cache
 from typing import NewType
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from flockd.core.messages import Float32Array, FloatArray
 from flockd.flight.geometry.cameras import Camera
@@ -33,12 +34,7 @@ def _axial_share(camera: Camera) -> Float32Array:
 
 
 def ground_inverse_depth(
-    camera: RigCamera,
-    R_ned_body: FloatArray,
-    height_m: float,
-    *,
-    stride: int = 1,
-    slope: tuple[float, float] = (0.0, 0.0),
+    camera: RigCamera, R_ned_body: FloatArray, height_m: float, slope: ArrayLike = (0.0, 0.0), *, stride: int = 1
 ) -> Float32Array:
     """(h, w) inverse depth, 1/m, of plane ground ``height_m`` straight below the body's origin; 0 above the horizon.
 
@@ -46,7 +42,7 @@ def ground_inverse_depth(
     networks. With ``stride`` the map is (h / stride, w / stride), each pixel for the centre of a block. Raises
     ValueError if the camera is not above the ground or ``stride`` does not divide the image.
     """
-    normal = np.array([*slope, 1.0])  # a point p in level axes is on the ground if n . p is the height
+    normal = np.append(slope, 1.0)  # a point p in level axes is on the ground if n . p is the height
     camera_height_m = height_m - float(normal @ R_ned_body @ camera.T_body_camera.translation)
     if not camera_height_m > 0.0:
         raise ValueError(f"camera {camera.name!r} is not above the ground: its height is {camera_height_m:.2f} m")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import cv2
@@ -25,17 +25,14 @@ def golden_image(size: Size, seed: int = 0) -> UInt8Array:
 
 def golden_feeds(manifest: Manifest) -> Feeds:
     """The golden input: a fixed image for every image, zeros for planes."""
-    size = manifest.golden_size
-    return _feeds(manifest, size, lambda number: [golden_image(size, number)])
+    return _feeds(manifest, manifest.golden_size, 1)
 
 
 def feeds_for(manifest: Manifest, image: Size, batch: int = 1) -> Feeds:
     """Inputs for an image of this size, width and height, or for a batch of crops; their content does not matter."""
-    fitting = fit(manifest, image)
     if manifest.crop is None:
-        return _feeds(manifest, fitting.full, lambda _: [fitting.enter(golden_image(image))])
-    size = (manifest.crop_size_px, manifest.crop_size_px)
-    return _feeds(manifest, size, lambda _: [golden_image(size, seed) for seed in range(batch)])
+        return _feeds(manifest, fit(manifest, image).full, 1)
+    return _feeds(manifest, (manifest.crop_size_px, manifest.crop_size_px), batch)
 
 
 def shapes_of(feeds: Mapping[str, NDArray[Any]]) -> dict[str, list[int]]:
@@ -43,12 +40,12 @@ def shapes_of(feeds: Mapping[str, NDArray[Any]]) -> dict[str, list[int]]:
     return {name: list(value.shape) for name, value in feeds.items()}
 
 
-def _feeds(manifest: Manifest, size: Size, images: Callable[[int], Sequence[UInt8Array]]) -> Feeds:
-    """Feeds for input images of ``size``; ``images`` gives the images for the number of an input. Planes are zero."""
+def _feeds(manifest: Manifest, size: Size, batch: int) -> Feeds:
+    """Feeds for ``batch`` input images of ``size``, of other content for each input. Planes are zero."""
     feeds: Feeds = {}
     for number, (name, spec) in enumerate(manifest.inputs.items()):
         if spec.kind == "image":
-            feeds[name] = entering(spec, images(number))
+            feeds[name] = entering(spec, [golden_image(size, number + seed) for seed in range(batch)])
             continue
         planes, stride = spec.shape[1], manifest.map_stride
         assert isinstance(planes, int)

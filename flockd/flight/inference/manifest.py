@@ -209,9 +209,10 @@ class Manifest(Section):
         images = [spec for spec in self.inputs.values() if spec.kind == "image"]
         if not images:
             yield ("inputs",), "has no image; give one input `kind: image`"
+            return
         if self.map_stride is None and len(images) < len(self.inputs):
             yield ("map_stride",), "is missing; write how many image pixels one number of the planes stands for"
-        if self.crop is not None and any(len(set(spec.image_size)) > 1 or not _is_fixed(spec) for spec in images):
+        if self.crop is not None and (self.fixed_size is None or len(set(self.fixed_size)) > 1):
             yield ("crop",), "is for models whose image input is square and of a fixed size; delete it"
 
 
@@ -219,10 +220,6 @@ def _located(section: Key, specs: Mapping[str, InputSpec] | Mapping[str, OutputS
     for name, spec in specs.items():
         for key, message in spec.faults():
             yield (*section, name, *key), message
-
-
-def _is_fixed(spec: InputSpec) -> bool:
-    return all(isinstance(size, int) for size in spec.image_size)
 
 
 def listed(shape: tuple[int | str | None, ...] | list[int | str | None]) -> str:

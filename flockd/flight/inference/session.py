@@ -18,7 +18,6 @@ from flockd.flight.inference.manifest_file import ManifestFile, read_manifest
 from flockd.flight.inference.providers import (
     SLOW_TO_BUILD,
     Prepared,
-    Shapes,
     engine_folder,
     open_runtime,
     provider_of,
@@ -117,11 +116,6 @@ class OnnxModel:
             feeds[name] = content if isinstance(content, np.ndarray) else entering(spec, content)
         specs = self.manifest.outputs
         return {specs[name].gives or name: leaving(specs[name], value) for name, value in self.run(feeds).items()}
-
-    def keep_engines(self, shapes: Sequence[Shapes]) -> None:
-        """Records that the engines in the folder cover these shapes and all between them."""
-        if self.engines is not None:
-            Prepared(shapes).save(self.engines)
 
     def terminate(self) -> None:
         """Ends the current runs, from any thread; they raise errors of the library."""

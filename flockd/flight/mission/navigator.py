@@ -60,15 +60,11 @@ class Navigator:
         self._course_rad, self._turned_s = guidance.course_rad, moment.time_s
         return guidance
 
-    def pull(self, guidance: Guidance) -> FloatArray:
-        """(2,) m/s: efv of Eq. 42 times the mission's W_i, which is 0 for `follow`."""
-        return guidance.velocity * self._parameters.pull
-
     def status(self, guidance: Guidance) -> MissionStatus:
         """For telemetry and recordings; see `PilotOutput.mission`."""
         return MissionStatus(
             kind=self._parameters.kind,
-            desired=self.pull(guidance),
+            desired=guidance.velocity * self._parameters.pull,
             sentence=guidance.sentence,
             goal=guidance.goal,
             goal_height_m=guidance.height_m,

@@ -119,14 +119,8 @@ class Perception:
         """The inverse depth of the ground at the maps' stride; None: not known. Raises ValueError."""
         if ground is None or not self._needs_ground:
             return None
-        north, east = (float(rise) for rise in ground.slope)
-        return ground_inverse_depth(
-            self._rig.cameras[camera],
-            vehicle.R_ned_body,
-            ground.height_m,
-            stride=self._networks.map_stride,
-            slope=(north, east),
-        )
+        mounted, stride = self._rig.cameras[camera], self._networks.map_stride
+        return ground_inverse_depth(mounted, vehicle.R_ned_body, ground.height_m, ground.slope, stride=stride)
 
     def _pair(self, frames: FrameSet) -> tuple[Observation | None, Reasons]:
         """The observation before; None if time runs backwards."""

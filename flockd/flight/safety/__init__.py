@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from flockd.flight.safety.events import OFFBOARD, CameraHealth, Event, Inputs, MissionEnd, link_lost
+from flockd.flight.safety.events import OFFBOARD, CameraHealth, Event, Inputs, link_lost
 from flockd.flight.safety.fence import outside_fence, outside_heights
 from flockd.flight.safety.gate import Gate
 from flockd.flight.safety.policy import Action
@@ -18,7 +18,6 @@ __all__ = [
     "Event",
     "Gate",
     "Inputs",
-    "MissionEnd",
     "Objection",
     "Permission",
     "Request",

@@ -27,13 +27,6 @@ class CameraHealth:
     same image or the same sequence number. `noisy`: its images have been noise for too long. None: none of these."""
 
 
-class MissionEnd(StrEnum):
-    """How a mission that is over ends the flight."""
-
-    LAND = "land"
-    RETURN = "return"
-
-
 @dataclass(frozen=True)
 class Inputs:
     """All inputs of the supervisor, at one instant. NaN counts as a fault."""
@@ -105,8 +98,8 @@ class Inputs:
     land_asked: bool
     resume_asked: bool
     """Whether an operator asked, since the last call, to be ready again after a flight that ended in the air."""
-    mission_over: MissionEnd | None = None
-    """How the flight's mission ended; None: it has not, or it ends in the air."""
+    takeover: str | None = None
+    """As of `MissionStatus`."""
 
 
 class Event(StrEnum):
@@ -229,8 +222,8 @@ def notice(inputs: Inputs, p: SafetyParameters) -> dict[Event, str]:
         (Event.SHUTDOWN_ASKED, inputs.shutdown_asked, "flockd was asked to end"),
         (Event.HOLD_ASKED, inputs.hold_asked, "an operator asked for Hold"),
         (Event.LAND_ASKED, inputs.land_asked, "an operator asked for Land"),
-        (Event.MISSION_LANDS, inputs.mission_over is MissionEnd.LAND, "the mission is over and ends with Land"),
-        (Event.MISSION_RETURNS, inputs.mission_over is MissionEnd.RETURN, "the mission is over and ends with Return"),
+        (Event.MISSION_LANDS, inputs.takeover == "land", "the mission is over and ends with Land"),
+        (Event.MISSION_RETURNS, inputs.takeover == "return", "the mission is over and ends with Return"),
     )
     return {event: sentence for event, holds, sentence in table if holds}
 

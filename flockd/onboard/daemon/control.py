@@ -18,7 +18,6 @@ from flockd.flight.safety import (
     Action,
     Decision,
     Event,
-    MissionEnd,
     Permission,
     Request,
     State,
@@ -86,7 +85,7 @@ class Control:
             self._history.add(vehicle)
         obstacle_m = math.inf if self._request is None else self._request.around.nearest_obstacle_m
         inputs = self._input_collector.collect(
-            status, vehicle, self._operator, self._mission_over(), self._streamer.report().fault, obstacle_m
+            status, vehicle, self._operator, self._end_of_mission(), self._streamer.report().fault, obstacle_m
         )
         before, now = self.decision, self._clock()
         self.decision = self._supervisor.step(now, inputs)
@@ -100,13 +99,12 @@ class Control:
         if self._request is not None:
             self._streamer.offer(replace(self._request, permission=Permission(Action.ASK_HOLD, self._clock())))
 
-    def _mission_over(self) -> MissionEnd | None:
-        """How this flight's mission ended; None: it has not, or the drone does not fly."""
+    def _end_of_mission(self) -> str | None:
+        """`MissionStatus.takeover` of this flight; None also while the drone does not fly."""
         result = self._pilot_loop.newest
         if self.decision.state not in FLYING or result is None or result.flight != self._flight:
             return None
-        takeover = result.output.mission.takeover
-        return None if takeover is None else MissionEnd(takeover)
+        return result.output.mission.takeover
 
     def _begin_or_end_flight(self, before: Decision, vehicle: VehicleState | None) -> None:
         """A flight begins with a new pilot, and holds the drone's height and heading at that time."""

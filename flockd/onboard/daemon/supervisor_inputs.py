@@ -13,7 +13,7 @@ import numpy as np
 
 from flockd.core.config import DroneConfig
 from flockd.core.messages import FloatArray, VehicleState
-from flockd.flight.safety import CameraHealth, Gate, Inputs, MissionEnd, Objection, outside_fence, outside_heights
+from flockd.flight.safety import CameraHealth, Gate, Inputs, Objection, outside_fence, outside_heights
 from flockd.onboard.autopilot.autopilot_status import AutopilotStatus
 from flockd.onboard.daemon.operator_orders import OperatorRequests
 from flockd.onboard.daemon.pilot_loop import PilotLoop
@@ -59,7 +59,7 @@ class InputCollector:
         status: AutopilotStatus,
         vehicle: VehicleState | None,
         operator: OperatorRequests,
-        mission_over: MissionEnd | None,
+        takeover: str | None,
         stream_fault: str | None,
         obstacle_m: float,
     ) -> Inputs:
@@ -115,7 +115,7 @@ class InputCollector:
             hold_asked=operator.hold,
             land_asked=operator.land,
             resume_asked=operator.resume,
-            mission_over=mission_over,
+            takeover=takeover,
         )
         self._faults_before += inputs.network_faults
         self._refused_before += inputs.refused_commands

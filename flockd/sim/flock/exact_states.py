@@ -91,7 +91,7 @@ class ExactFlock:
             ages_s = np.array([one.age_s for one in seen]) if self._tracked else math.inf
             moment = Moment(time_s, here, middle_of(places[:, :2]), np.array(REFERENCE_DEG), order=orders.get(i))
             guidance = pilot.step(moment)
-            desired, around = pilot.pull(guidance), ranges[i]
+            desired, around = pilot.status(guidance).desired, ranges[i]
             if around is not None and self._avoids:
                 flown_as = self._avoidances[i].command(self._law, moving, places, others, desired, around, ages_s)
             elif self._passes:

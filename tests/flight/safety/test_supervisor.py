@@ -17,7 +17,6 @@ from flockd.flight.safety import (
     Decision,
     Event,
     Inputs,
-    MissionEnd,
     State,
     Supervisor,
     link_lost,
@@ -148,8 +147,8 @@ FAULTS = {
     Event.SHUTDOWN_ASKED: Fault({"shutdown_asked": True}, "latch", Action.ASK_HOLD),
     Event.HOLD_ASKED: Fault({"hold_asked": True}, "latch", Action.ASK_HOLD),
     Event.LAND_ASKED: Fault({"land_asked": True}, "latch", Action.ASK_LAND),
-    Event.MISSION_LANDS: Fault({"mission_over": MissionEnd.LAND}, "ready", Action.ASK_LAND),
-    Event.MISSION_RETURNS: Fault({"mission_over": MissionEnd.RETURN}, "ready", Action.ASK_RETURN),
+    Event.MISSION_LANDS: Fault({"takeover": "land"}, "ready", Action.ASK_LAND),
+    Event.MISSION_RETURNS: Fault({"takeover": "return"}, "ready", Action.ASK_RETURN),
 }
 """faults.md, fault by fault."""
 

@@ -200,13 +200,9 @@ class Cascade:
         near = np.isfinite(estimates.log_range) & (estimates.log_range < math.log(2 * self._parameters.max_range_m))
         ranges = np.exp(np.where(near, estimates.log_range, 0.0))[:, None]
         places = np.where(near[:, None], views.centres, 0.0) + ranges * estimates.bearing
-        range_m = np.linalg.norm(places, axis=1)
-        placed = range_m > 0.0
-        for place in places[range_m <= 0.0]:  # not of those without an estimate
-            self._drop(f"a place at {place.tolist()} m has no bearing")
-        range_m = np.where(placed, range_m, 1.0)
+        range_m = np.maximum(np.linalg.norm(places, axis=1), np.finfo(np.float64).tiny)
         log_range = np.where(near, np.log(range_m), estimates.log_range)
-        return at[placed], estimates._replace(bearing=places / range_m[:, None], log_range=log_range).take(placed)
+        return at, estimates._replace(bearing=places / range_m[:, None], log_range=log_range)
 
     def _ranges(self, crops: Sequence[Crop]) -> RangeEstimates:
         """An estimate for each crop. If the network fails on several, each half is tried alone: one crop is lost."""
