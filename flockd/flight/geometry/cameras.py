@@ -8,7 +8,9 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar
 
+import cv2
 import numpy as np
+from numpy.polynomial.polynomial import polyval
 
 from flockd.core.messages import BoolArray, FloatArray
 
@@ -121,7 +123,7 @@ class PinholeCamera(Camera):
         derivative[:, 0, 0] = inverse_z
         derivative[:, 1, 1] = inverse_z
         derivative[:, :, 2] = -normalised * inverse_z[:, None]
-        if self.distortion:
+        if self.distortion and len(points):
             derivative = self._distortion_jacobian(normalised) @ derivative
         scaled: FloatArray = derivative * self.matrix[[0, 1], [0, 1]][:, None]
         return scaled
@@ -164,17 +166,10 @@ class PinholeCamera(Camera):
         )
 
     def _distortion_jacobian(self, normalised: FloatArray) -> FloatArray:
-        k1, k2, p1, p2, k3 = self._coefficients()
-        x, y = normalised.T
-        r2 = x * x + y * y
-        radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        slope = 2.0 * (k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3))  # d radial / d(r^2), times 2
-        derivative = np.empty((len(x), 2, 2))
-        derivative[:, 0, 0] = radial + slope * x * x + 2.0 * p1 * y + 6.0 * p2 * x
-        derivative[:, 0, 1] = slope * x * y + 2.0 * p1 * x + 2.0 * p2 * y
-        derivative[:, 1, 0] = derivative[:, 0, 1]
-        derivative[:, 1, 1] = radial + slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x
-        return derivative
+        """(n, 2, 2) derivative of `_distort`, by OpenCV: of pixels by the translation of points at z = 1."""
+        points, still = np.insert(normalised, 2, 1.0, axis=1), np.zeros(3)
+        derivative = cv2.projectPoints(points, still, still, np.eye(3), np.array(self.distortion))[1][:, 3:5]
+        return np.asarray(derivative, np.float64).reshape(-1, 2, 2)
 
     def _undistort(self, distorted: FloatArray) -> FloatArray:
         """Newton's method; NaN if no undistorted point gives the distorted one."""
@@ -250,17 +245,10 @@ class WideAngleCamera(Camera):
         return min(math.pi, _first_turning_point(self.distortion)) if self.distortion else math.pi
 
     def _radius(self, theta: FloatArray) -> FloatArray:
-        polynomial = np.ones_like(theta)
-        for power, k in enumerate(self.distortion, start=1):
-            polynomial += k * theta ** (2 * power)
-        radius: FloatArray = theta * polynomial
-        return radius
+        return np.asarray(theta * polyval(theta**2, (1.0, *self.distortion)))
 
     def _slope(self, theta: FloatArray) -> FloatArray:
-        slope = np.ones_like(theta)
-        for power, k in enumerate(self.distortion, start=1):
-            slope += (2 * power + 1) * k * theta ** (2 * power)
-        return slope
+        return np.asarray(polyval(theta**2, _derivative(self.distortion)))
 
     def _theta(self, radius: FloatArray) -> FloatArray:
         """Newton's method, by halves where it would leave what is known; NaN beyond the largest imaged angle."""
@@ -280,12 +268,16 @@ class WideAngleCamera(Camera):
         return np.where(imaged, theta, np.nan)
 
 
+def _derivative(coefficients: tuple[float, ...]) -> list[float]:
+    """Coefficients of the derivative of ``x (1 + c1 x^2 + c2 x^4 + ...)``, by powers of x^2."""
+    return [1.0, *((2 * power + 1) * c for power, c in enumerate(coefficients, start=1))]
+
+
 def _first_turning_point(coefficients: tuple[float, ...]) -> float:
     """The smallest positive x at which ``x (1 + c1 x^2 + c2 x^4 + ...)`` stops growing; infinity if it never does.
 
     Beyond it the polynomial does not describe a lens: directions further out would fold back into the image.
     """
-    derivative = [1.0, *((2 * power + 1) * c for power, c in enumerate(coefficients, start=1))]
-    roots = np.roots(derivative[::-1])
+    roots = np.roots(_derivative(coefficients)[::-1])
     turning = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0.0)]
     return math.sqrt(float(turning.min())) if len(turning) else math.inf

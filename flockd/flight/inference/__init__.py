@@ -4,10 +4,4 @@ from flockd.flight.inference.manifest import Manifest
 from flockd.flight.inference.manifest_file import find_manifests, load_manifest, manifests_of
 from flockd.flight.inference.session import OnnxModel
 
-__all__ = [
-    "Manifest",
-    "OnnxModel",
-    "find_manifests",
-    "load_manifest",
-    "manifests_of",
-]
+__all__ = ["Manifest", "OnnxModel", "find_manifests", "load_manifest", "manifests_of"]
