@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from flockd.core.config.flocking import WeightParameters
+from flockd.core.config.flocking import FlockingParameters, WeightParameters
 from flockd.core.config.mission import MissionParameters
-from flockd.flight.flocking import FlockingLaw, FlockingParameters
-from flockd.flight.flocking.law import level_offsets
+from flockd.flight.flocking.law import FlockingLaw, level_offsets
 from flockd.flight.mission.circle_then_tangent import course, desired_velocity
 from flockd.review.metrics import min_distance, obj1, obj2, pair_distances
 

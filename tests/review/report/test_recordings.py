@@ -13,15 +13,7 @@ import pytest
 
 from flockd.cli import main
 from flockd.core.config import DroneConfig
-from flockd.core.messages import (
-    EgoMotion,
-    FrameSet,
-    LearnedSize,
-    MissionOrder,
-    MissionStatus,
-    PilotOutput,
-    VehicleState,
-)
+from flockd.core.messages import NO_STATUS, EgoMotion, FrameSet, LearnedSize, MissionOrder, PilotOutput, VehicleState
 from flockd.flight.geometry import RangeMap
 from flockd.flight.perception import Observation
 from flockd.flight.perception.observation import CameraObservation
@@ -73,8 +65,7 @@ def output_of(drone: int, step: int, time_s: float) -> PilotOutput:
     known = make.neighbour((0.0, east_m, 0.0), (1.0, 0.0, 0.0), track=7)
     false = replace(known, track=9, position=np.array([-20.0, 0.0, 0.0]))
     neighbours = [known] * (step >= UNKNOWN_STEPS) + [false] * (drone == 0 and step == 5)
-    course_rad = STEP_S * step / 10.0  # Eq. 43 with the defaults: 1 m/s around a circle of 10 m
-    desired = np.array([np.cos(course_rad), np.sin(course_rad)])
+    desired = np.exp(1j * STEP_S * step / 10.0)  # Eq. 43 with the defaults: 1 m/s around a circle of 10 m
     moved = EgoMotion(np.eye(3), np.array([STEP_S + LONG_M, 0.0, 0.0]), STEP_S, 100, 80, 0.1)
     return make.output(
         time_s,
@@ -85,7 +76,7 @@ def output_of(drone: int, step: int, time_s: float) -> PilotOutput:
         neighbours=tuple(neighbours),
         command=make.wanted((1.0, 0.1)),
         stages_ms={"scene": 10.0 + step},
-        mission=MissionStatus("circle_then_tangent", desired, "on the circle"),
+        mission=replace(NO_STATUS, desired=np.array([desired.real, desired.imag])),
     )
 
 

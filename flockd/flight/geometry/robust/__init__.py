@@ -1,1 +1,1 @@
-"""Robust fits: RANSAC, robust kernels, and one nonlinear least-squares solver."""
+"""Robust fits: RANSAC and robust kernels."""
