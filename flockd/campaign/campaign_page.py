@@ -13,7 +13,7 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Drawing
 
-from flockd.campaign.figures import MEASURES, Figure, Interval, mean_interval
+from flockd.campaign.figures import MEASURES, Figure, Interval, Measure, mean_interval
 from flockd.campaign.flight_plan import CASE
 from flockd.campaign.results import Results, Row
 from flockd.core.data import written_whole
@@ -50,7 +50,7 @@ def write_campaign_page(results: Results, path: Path) -> None:
         facts=[
             ("Flights", flown, "", f"of {results.plan.flights}"),
             ("Failed", len(results.failures), "", "see below" if results.failures else "none"),
-            ("Flown in", f"{results.core_s / 3600:.2g}", "hours", "on one core, all flights together"),
+            ("Flown in", f"{results.core_s / 60:.2g}", "minutes", "on one core, all flights together"),
         ],
         sections=_parts(results),
         text_columns=(REASON, AGAIN),
@@ -125,6 +125,8 @@ def _count(number: int, thing: str) -> str:
 
 _COLUMNS: Final = 3
 _PANEL_IN: Final = (3.6, 2.5)
+_LETTERS: Final = 44
+"""As many letters as fit below a panel; longer names of values stand upright."""
 Points = list[tuple[Any, Sequence[float]]]
 """Values of a parameter, each with a figure's value of each seed."""
 
@@ -140,8 +142,11 @@ def parameter_curves(results: Results, figure: Figure) -> Drawing:
         cases = results.values_of(CASE)
     columns = min(len(parameters), _COLUMNS)
     rows = -(-len(parameters) // columns)
+    letters = _LETTERS if len(parameters) > 1 else 2 * _LETTERS
+    high = {name: _names_height_in(results.values_of(name), letters) for name in parameters}
     with rc_context(STYLE):
-        drawing = Drawing(figsize=(_PANEL_IN[0] * max(columns, 2), _PANEL_IN[1] * rows), layout="constrained")
+        size = (_PANEL_IN[0] * max(columns, 2), (_PANEL_IN[1] + max(high.values())) * rows)
+        drawing = Drawing(figsize=size, layout="constrained")
         panels = drawing.subplots(rows, columns, sharey=True, squeeze=False)
         for axes, parameter in zip(panels.flat, parameters, strict=False):
             for number, case in enumerate(cases):
@@ -151,15 +156,16 @@ def parameter_curves(results: Results, figure: Figure) -> Drawing:
                     (value, list(results.by_seed(figure, results.cells_with({**of_case, parameter: value})).values()))
                     for value in results.values_of(parameter)
                 ]
-                _band(axes, points, colour, case, is_share=MEASURES[figure].is_share, unit=MEASURES[figure].unit)
+                _band(axes, points, colour, case, MEASURES[figure], beside=(number + 1) / (len(cases) + 1) - 0.5)
             axes.set_xlabel(parameter)
+            axes.tick_params(axis="x", labelrotation=90 if high[parameter] else 0)
         for axes in panels.flat[len(parameters) :]:
             axes.set_axis_off()
         for axes in panels[:, 0]:
-            axes.set_ylabel(textwrap.fill(label_of(figure), 26))
-            low, high = axes.get_ylim()
-            if high - low < 0.2 and np.ptp(axes.dataLim.intervaly) == 0.0:  # a constant, which is no scatter of 0.04
-                axes.set_ylim(max(low - 0.5, min(low, 0.0)), high + 0.5)
+            axes.set_ylabel(textwrap.fill(label_of(figure), 30))
+            low, top = axes.get_ylim()
+            if top - low < 0.2 and np.ptp(axes.dataLim.intervaly) == 0.0:  # a constant, which is no scatter of 0.04
+                axes.set_ylim(max(low - 0.5, min(low, 0.0)), min(top + 0.5, max(MEASURES[figure].highest + 0.05, top)))
         if len(cases) > 1:
             drawing.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside upper left", ncols=len(cases))
     return drawing
@@ -176,24 +182,35 @@ def shown(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def _band(axes: Axes, points: Points, colour: str, label: str | None, *, is_share: bool, unit: str) -> None:
+def _band(axes: Axes, points: Points, colour: str, label: str | None, measure: Measure, *, beside: float) -> None:
+    """One line of a panel; where values are no numbers, points that stand ``beside`` those of other cases."""
     known = [(value, seeds) for value, seeds in points if len(seeds)]
     if not known:
         axes.text(0.5, 0.5, "no numbers to draw", transform=axes.transAxes, ha="center", color=MUTED)
         return
     values = [value for value, _ in known]
-    numeric = all(isinstance(value, int | float) and not isinstance(value, bool) for value in values)
+    numeric = _are_numbers(values)
     places = np.array(values if numeric else range(len(values)), dtype=float)
-    intervals = [mean_interval(s, is_share=is_share and set(s) <= {0.0, 1.0}) for _, s in known]
+    intervals = [mean_interval(s, is_share=measure.is_share and set(s) <= {0.0, 1.0}) for _, s in known]
     means = np.array([np.mean(seeds) for _, seeds in known])
     ends = np.array([(np.nan, np.nan) if i is None else (i.low, i.high) for i in intervals])
-    ends = np.clip(ends, 0.0, 1.0) if is_share or unit == "of 1" else ends
+    ends = np.clip(ends, measure.lowest, measure.highest)
     if numeric and len(places) > 1:
         axes.plot(places, means, color=colour, marker="o", markersize=3.5, label=label)
         axes.fill_between(places, ends[:, 0], ends[:, 1], color=colour, alpha=0.2, linewidth=0)
     else:
         reach = np.abs(ends.T - means)
-        axes.errorbar(places, means, reach, color=colour, fmt="o", capsize=4, label=label)
+        axes.errorbar(places + 0.5 * beside, means, reach, color=colour, fmt="o", capsize=4, label=label)
     if not numeric:
         axes.set_xticks(places, [shown(value) for value in values])
         axes.set_xlim(-0.5, len(values) - 0.5)
+
+
+def _are_numbers(values: Sequence[Any]) -> bool:
+    return all(isinstance(value, int | float) and not isinstance(value, bool) for value in values)
+
+
+def _names_height_in(values: Sequence[Any], letters: int) -> float:
+    """How high the names of values stand below a panel, inches: 0 if they fit beside each other."""
+    lengths = [len(shown(value)) for value in values]
+    return 0.0 if _are_numbers(values) or max(lengths) * len(lengths) <= letters else 0.07 * max(lengths)

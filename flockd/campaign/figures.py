@@ -70,6 +70,9 @@ class Measure:
     """Its keys in a flight's summary, or a function of log and summary."""
     is_share: bool = False
     """The figure is 0 or 1 for one flight, so that its mean is a share of flights."""
+    lowest: float = 0.0
+    highest: float = math.inf
+    """What the figure can be: no interval that is drawn goes beyond."""
 
 
 def _nearest_at_the_end(log: FlightLog, _: dict[str, Any]) -> float:
@@ -108,24 +111,28 @@ def _convergence_time(log: FlightLog, summary: dict[str, Any]) -> float | None:
 MEASURES: dict[str, Measure] = {
     "min_distance_m": Measure("nearest distance", "m", "higher", "flock.min_distance_m"),
     "min_distance_after_10s_m": Measure("nearest distance after 10 s", "m", "higher", "flock.min_distance_after_10s_m"),
-    "order_tail": Measure("order at the end", "", "higher", "flock.order_tail"),
-    "union_tail": Measure("union at the end", "", "higher", "flock.union_tail"),
-    "safety": Measure("safety", "", "higher", "flock.safety"),
-    "velocity_deviation_tail": Measure("velocity deviation at the end, Σ obj1", "", "lower", _tail_mean("obj1")),
+    "order_tail": Measure("order at the end", "", "higher", "flock.order_tail", lowest=-1.0, highest=1.0),
+    "union_tail": Measure("union at the end", "", "higher", "flock.union_tail", highest=1.0),
+    "safety": Measure("pairs 1 m apart or more", "of 1", "higher", "flock.safety", highest=1.0),
+    "velocity_deviation_tail": Measure(
+        "velocity deviation at the end, Σ obj1", "", "lower", _tail_mean("obj1"), lowest=-math.inf
+    ),
     "shape_deviation_tail": Measure("shape deviation at the end, Σ obj2", "", "lower", _tail_mean("obj2")),
-    "arrived": Measure("arrived", "of the flights", "higher", "mission.arrived", is_share=True),
+    "arrived": Measure("arrived", "of the flights", "higher", "mission.arrived", is_share=True, highest=1.0),
     "arrival_time_s": Measure("time of arrival", "s", "lower", "mission.time_s"),
     "final_error_m": Measure("distance from the goal at the end", "m", "lower", "mission.final_error_m"),
     "collisions": Measure("collisions with obstacles", "", "lower", "obstacles.collisions"),
-    "min_clearance_m": Measure("least clearance", "m", "higher", "obstacles.min_clearance_m"),
+    "min_clearance_m": Measure("least clearance", "m", "higher", "obstacles.min_clearance_m", lowest=-math.inf),
     "time_within_1m_s": Measure("time within 1 m of obstacles", "s", "lower", "obstacles.time_within_1m_s"),
-    "recall_within_10m": Measure("neighbours known within 10 m", "", "higher", "neighbours.recall_within_10m"),
+    "recall_within_10m": Measure(
+        "neighbours known within 10 m", "", "higher", "neighbours.recall_within_10m", highest=1.0
+    ),
     "false_per_drone_minute": Measure(
         "false neighbours a drone and minute", "", "lower", "neighbours.false_per_drone_minute"
     ),
     "distance_error_median_m": Measure("distance error, median", "m", "lower", _distance_error(50.0)),
     "distance_error_p95_m": Measure("distance error, 95th percentile", "m", "lower", _distance_error(95.0)),
-    "false_share": Measure("time with a false neighbour", "of 1", "lower", "neighbours.false_share"),
+    "false_share": Measure("time with a false neighbour", "of 1", "lower", "neighbours.false_share", highest=1.0),
     "associated_error_median_m": Measure("error of all tracks, median", "m", "lower", _of_tracks("median")),
     "associated_error_p95_m": Measure("error of all tracks, 95th percentile", "m", "lower", _of_tracks("p95")),
     "associated_error_max_m": Measure("error of all tracks, largest", "m", "lower", _of_tracks("max")),
@@ -139,7 +146,7 @@ MEASURES: dict[str, Measure] = {
     "collisions_flown": Measure(
         "collisions with obstacles while flockd flew", "", "lower", "handed_over.collisions_flown"
     ),
-    "slowed_share": Measure("time slowed by gates", "of 1", "lower", "slowed_share"),
+    "slowed_share": Measure("time slowed by gates", "of 1", "lower", "slowed_share", highest=1.0),
 }
 
 

@@ -6,11 +6,12 @@ import csv
 import fcntl
 import os
 import re
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
 
-from flockd.campaign.campaign_page import write_campaign_page
+from flockd.campaign.campaign_page import parameter_curves, write_campaign_page
 from flockd.campaign.flight_plan import Plan
 from flockd.campaign.folder import LINES_NAME, CampaignFolder
 from flockd.campaign.results import Results, compare
@@ -192,6 +193,24 @@ def test_the_report_says_what_was_flown(plan: Plan, tmp_path: Path) -> None:
     mean = results.interval("min_distance_m", [1])
     assert mean is not None
     assert sorted(results.by_seed("min_distance_m", [0, 1])) == [0, 1, 2, 4, 5]
+
+
+def test_names_of_eight_cases_stand_apart_and_no_interval_of_a_share_ends_below_zero(tmp_path: Path) -> None:
+    cases = ", ".join(f"case_{number}_with_a_long_name: {{vehicle.gust_m_s: 0.{number}}}" for number in range(8))
+    fixed = "{drone.flocking.cohesion: 0, drone.flocking.separation: 8}"
+    text = f"cases: {{{cases}}}\nmeasure: [slowed_share]\nfixed: {fixed}\n"
+    flown(Plan.load(campaign_file(tmp_path, text)), tmp_path / "out", Shuffled(1))
+    results = Results.load(tmp_path / "out")
+    interval = results.interval("slowed_share", [0])
+    assert interval is not None
+    assert interval.low < 0.0 < interval.mean < 1.0
+    drawing = parameter_curves(results, "slowed_share")
+    drawing.draw_without_rendering()
+    (axes,) = drawing.axes
+    assert axes.dataLim.y0 == 0.0
+    extents = [label.get_window_extent() for label in axes.get_xticklabels()]
+    assert len(extents) == 8
+    assert all(left.x1 < right.x0 for left, right in pairwise(extents))
 
 
 def test_figures_stand_under_the_case_and_the_value_that_were_flown(tmp_path: Path) -> None:
