@@ -146,6 +146,7 @@ def test_a_doubtful_detection_begins_a_less_likely_track(probability: float, exi
     assert flock.one.existence_probability == pytest.approx(existence * probability)
 
 
+@pytest.mark.fault("vague-detections")
 def test_beside_well_known_drones_a_vague_detection_is_less_likely_a_drone_and_slows_less() -> None:
     """By hand: a range sigma of 20 % is 8 times twice the usual 1.25 %, so the odds of existence begin at an eighth. A
     shadow is detected again and again, as a drone is, and is not confirmed for it."""
