@@ -105,12 +105,12 @@ def _clearest(
     sum, m/s; and whether it is in all half-planes.
 
     An exact penalty: it is the nearest velocity in all half-planes, unless those are nearly opposite and meet far away.
-    There the least violation alone would be bought with the highest speed, to a side.
+    There the least violation alone would lead sideways at the highest speed.
     """
     normals, least = np.reshape([one[0] for one in planes], (-1, 2)), np.array([one[1] for one in planes])
     if (normals @ wanted >= least - ROUNDING_M_S).all():
         return wanted, 0.0, True
-    towards, most_m_s = (one[limits[1] < max_speed_m_s] for one in limits)  # the others do not bind
+    towards, most_m_s = (one[limits[1] < max_speed_m_s] for one in limits)  # no velocity exceeds the others
     across, at_m_s = np.vstack([normals, towards]), np.concatenate([least, most_m_s])
     feet = wanted + (at_m_s - across @ wanted)[:, None] * across
     tried = np.vstack([np.zeros(2), feet, crossings(across, at_m_s)])
