@@ -35,8 +35,8 @@ class Requirements:
 _GEOMETRY = ("geometry",)
 """Planes: tangents of the rays right and down, and inverse depth (1/m) of flat ground, 0 where unknown."""
 _OF_CROPS = {
-    "drone_probability": _PROBABILITY,  # from it on one picture alone shows a drone
-    "another_crop_probability": _PROBABILITY,  # up to it a proposal is refused without another crop
+    "drone_probability": _PROBABILITY,  # from it on, a single picture is enough
+    "another_crop_probability": _PROBABILITY,  # up to it, no further crop is examined
 }
 _OF_BOXES = ("centre_right_px", "centre_down_px", "width_px", "height_px", "drone_probability")
 _OF_RANGES = ("log_range_per_focal", "right_px", "down_px", "log_relative_sigma", "drone_logit", "log_apparent_size")
@@ -49,7 +49,7 @@ REQUIREMENTS: Mapping[Role, Requirements] = {
         outputs={"drone": (), "offset": ()},
         optional_inputs=_GEOMETRY,
         thresholds={
-            "proposal_logit": _LOGIT,  # from it pixels make proposals: the second stage refuses what is no drone
+            "proposal_logit": _LOGIT,  # pixels above it make proposals, which the second stage checks
         },
         map_stride=True,
     ),
@@ -57,13 +57,13 @@ REQUIREMENTS: Mapping[Role, Requirements] = {
         inputs=("image",),
         outputs={"boxes": _OF_BOXES},
         thresholds={
-            "box_probability": _POSITIVE,  # a box of less is not proposed
-            "overlap": _PROBABILITY,  # of two boxes with a larger intersection over union the more probable one stays
-            "evidence_gain": _LIMIT,  # the weight of a box's log odds beside those of the second stage
-            "large_box_evidence": _LOGIT,  # added to them for a box of 300 pixels and more, nothing up to 40
-            "small_box_evidence": _LOGIT,  # added for a box of 8 pixels and less, nothing from 20 on
-            "no_box_evidence": _LOGIT,  # the log odds of what the segmentation alone proposes
-            "distance_logit_limit": _LIMIT,  # that of `verification`, if there is a detector
+            "box_probability": _POSITIVE,  # least probability of a proposed box
+            "overlap": _PROBABILITY,  # largest intersection over union of two boxes
+            "evidence_gain": _LIMIT,  # factor on a box's log odds before they are added to the second stage's
+            "large_box_evidence": _LOGIT,  # log odds added for a box of 300 pixels and more, 0 up to 40
+            "small_box_evidence": _LOGIT,  # log odds added for a box of 8 pixels and less, 0 from 20 on
+            "no_box_evidence": _LOGIT,  # log odds added for a proposal of the segmentation alone
+            "distance_logit_limit": _LIMIT,  # replaces that of `verification`
         },
     ),
     "distance": Requirements(
@@ -73,14 +73,14 @@ REQUIREMENTS: Mapping[Role, Requirements] = {
             **_OF_CROPS,
             "bearing_sigma_rad": _POSITIVE,  # standard deviation of a refined bearing, each way
             "min_relative_sigma": _PROBABILITY,  # least standard deviation of a range, as a share of it
-            "mean_sigma_factor": _POSITIVE,  # that of the mean of two crops, as a share of a single crop's
+            "mean_sigma_factor": _POSITIVE,  # sigma of the mean of two crops over that of one
         },
         crop=True,
     ),
     "verification": Requirements(
         inputs=("crop",),
         outputs={"drone": ("drone_logit",)},
-        # Up to the limit, the distance network's logit counts as well, for or against a drone.
+        # The distance network's logit is added, between minus and plus this limit.
         thresholds={**_OF_CROPS, "distance_logit_limit": _LIMIT},
     ),
 }
