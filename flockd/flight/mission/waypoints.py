@@ -113,7 +113,7 @@ class _Approach:
     def ended(self, time_s: float, away_m: float, speed_m_s: float, reached_m: float) -> bool:
         """Whether the flock came near and comes no nearer; never before it has moved."""
         reach_m = PATIENCE_S * speed_m_s
-        far = away_m > reached_m + 2 * reach_m  # farther than it flies from there in the meantime
+        far = away_m > reached_m + 2 * reach_m  # no longer near: patience begins anew
         if far or away_m <= self._nearest_m - PROGRESS * reach_m:
             self._nearest_m, self._since_s = away_m, time_s
         moved, near = self._nearest_m < self._first_m, self._nearest_m <= reached_m + reach_m
