@@ -20,7 +20,7 @@ TURNS = np.linspace(-math.pi, math.pi, 144, endpoint=False)
 LAST = 0.5
 """Cost of a turn away from the last direction, relative to one away from the wanted direction."""
 RIGHT_RAD = 0.02
-"""Extra cost of a turn to the left: of two equal ways all drones take the same."""
+"""Extra cost of a turn to the left: of two equal ways all drones take that to the right."""
 LEAST_SHARE = 0.3
 """Least share of the wanted speed, at any turn: the drone has to leave dead ends."""
 PACE_M_S = 1.5
@@ -34,7 +34,7 @@ class Avoidance:
 
     def __init__(self, parameters: ObstacleParameters, gate: GateParameters, step_s: float) -> None:
         self._parameters = parameters
-        # The next velocity comes a step later here too; the gate behind keeps its own, longer distance.
+        # Towards neighbours as towards obstacles, a step counts as reaction; the gate keeps its own, longer distance.
         self._gate = gate.model_copy(update={"neighbour_reaction_s": gate.reaction_s})
         self._step_s = step_s
         self._reaction_s = gate.reaction_s + step_s
