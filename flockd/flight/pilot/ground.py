@@ -149,7 +149,7 @@ class GroundPoint:
 
     time_s: float
     place: FloatArray
-    """(2,) metres north and east of a fixed origin: the drone's place. The beam's also moves with its tilt."""
+    """(2,) metres north and east of a fixed origin: the drone's place, as the beam's also moves with its tilt."""
     range_m: float
     """Slant range, as measured."""
     height_m: float

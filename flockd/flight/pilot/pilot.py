@@ -81,7 +81,7 @@ class FlockPilot:
     ) -> None:
         """``networks`` may be shared by several pilots; None: those that the configuration names. ``stopwatch``
         (seconds) only fills ``stages_ms``. ``observer`` replaces perception. ``learned``: the others' size from an
-        earlier flight. Without ``flies``, as before a flight, the output is not flown. Raises ModelError."""
+        earlier flight. ``flies``: whether the output is flown; false before a flight. Raises ModelError."""
         self._config = config
         self._rig = build_rig(config.rig)
         self._perception = observer or Perception(
@@ -148,7 +148,7 @@ class FlockPilot:
         observation = self._perception.observe(frames, vehicle, ground, predictions, trace.detection, laps.end, learned)
         trace.observation = observation
         if self._config.perception.height == "barometer":
-            ground = None  # the height alone gives the same
+            ground = None  # it would only repeat the vehicle's height
         ego, why_no_ego = self._ego_motion(observation, ground)
         laps.end("ego_motion")
         velocity = vehicle.velocity_ned if self._config.own_velocity == "autopilot" else self._own.velocity
@@ -346,7 +346,7 @@ class FlockPilot:
         self._order = None
         self._mission = self._navigator.status(guidance)
         desired = self._mission.desired
-        own = guidance.velocity if velocity is None else velocity[:2]  # before the first pair: the mission's
+        own = guidance.velocity if velocity is None else velocity[:2]  # at first the mission's velocity
         if self._ranging is None:
             tracks = [n.track for n in seen]
             limits = limits_towards(neighbours, vehicle.position, self._config.safety.gate, HORIZON_S)
@@ -362,7 +362,7 @@ class FlockPilot:
         ends = guidance.takeover is not None
         height_m = self._size.height(observation.time_s, vehicle, ground, guidance.height_m, neighbours, ends=ends)
         rises_m = 0.0
-        if ground is not None and ground.source == "range_finder":  # it may rise, before a climb is flown too
+        if ground is not None and ground.source == "range_finder":  # the ground may rise, until a climb is flown
             gate, steepest = self._config.safety.gate, self._config.perception.range_finder.max_slope
             climbs_s = self._config.step_s + gate.neighbour_reaction_s
             self._floor_m = vehicle.height_m - ground.height_m + gate.min_height_m
@@ -371,7 +371,7 @@ class FlockPilot:
             if most_m > room_m:
                 command = command * max(room_m / most_m, 0.0)
         if self._floor_m + rises_m > (self._first_height_m if height_m is None else height_m):
-            height_m = self._floor_m + rises_m  # also when the range is lost: not down again into a hill
+            height_m = self._floor_m + rises_m  # also without a range: it may not sink into a hill
         self._height_m = height_m
         self._mission = replace(self._mission, sentence=self._mission.sentence + self._size.sentence)
         trim = self._trim()

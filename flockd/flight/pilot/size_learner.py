@@ -150,7 +150,7 @@ class SizeLearner:
         """The height to command, with the weave added, as of `Wanted`. ``ends``: the mission is over."""
         if not self._learns:
             return wanted_m
-        if self._weave is None:  # simulated drones may share a name
+        if self._weave is None:  # not by name: simulated drones may share one
             begun = np.array([vehicle.height_m, *vehicle.R_ned_body.flat])
             self._weave = Weave(self._gate, self._name.encode() + begun.tobytes())
         needed = self._may_weave and self.learned is None and not ends
