@@ -80,7 +80,7 @@ class Inputs:
     foreign_setpoints: str | None
     """The evidence of another sender's setpoints; None: there is none."""
     parameter_fault: str | None
-    """The fault of an autopilot's parameter, before the flight or since; None: none."""
+    """The fault of an autopilot's parameter, before the flight or since; None: there is none."""
     frame_jumped: bool
     """Whether the autopilot's local frame or heading has jumped far in this flight."""
     flight_mode: str | None

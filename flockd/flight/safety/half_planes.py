@@ -25,7 +25,7 @@ def nearest_within(velocity: FloatArray, directions: FloatArray, limits: FloatAr
     over = directions @ velocity - limits
     if (over <= 0).all():
         return velocity
-    binding = ~(limits > np.hypot(*velocity) + ROUNDING_M_S)  # the others hold for any vector that is no longer
+    binding = ~(limits > np.hypot(*velocity) + ROUNDING_M_S)  # no vector of at most this length exceeds the others
     directions, limits, over = directions[binding], limits[binding], over[binding]
     feet = velocity - over[:, None] * directions
     candidates = np.vstack([np.zeros(2), feet, crossings(directions, limits)])

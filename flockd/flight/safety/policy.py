@@ -44,7 +44,7 @@ class Action(StrEnum):
     SILENCE = "silence"
     """Send nothing and request nothing."""
     OFFER = "offer"
-    """Send standstill, so that the autopilot lets the pilot switch to offboard; it does not follow it before that."""
+    """Send standstill, so that the autopilot lets the pilot switch to offboard; until then it ignores setpoints."""
     FLY = "fly"
     FLY_DEGRADED = "fly_degraded"
     HOVER = "hover"
