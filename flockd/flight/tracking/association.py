@@ -8,7 +8,7 @@ from scipy.optimize import linear_sum_assignment
 from flockd.core.messages import FloatArray
 
 _NO_PAIR = -1e9
-"""The cost of a measurement beyond every track's gate. Any number will do, because it has no other choice."""
+"""Cost of a measurement that no track's gate contains. The value does not matter: there is no alternative."""
 
 
 def assign(squared_distances: FloatArray, log_likelihoods: FloatArray, gate_sigma: float) -> dict[int, int]:

@@ -18,10 +18,10 @@ _SUREST = 0.999
 
 
 def begun(drone_probability: float, share: float, parameters: TrackingParameters) -> float:
-    """The probability for a new track from one detection.
+    """The existence probability, 0 to 1, of a new track from one detection with this probability of a drone.
 
-    Among doubtful detections clutter is denser by the ratio of the odds that confirm a track to theirs; among vague
-    ones by the ratio of their range sigma to that of drones, 1 / ``share``.
+    Clutter is denser among doubtful and vague detections. So the odds are multiplied by the detection's odds over those
+    that confirm a track, if these are higher, and by its ``share``, 0 to 1: the usual range sigma over its own.
     """
     doubt = _log_odds(drone_probability) - _log_odds(parameters.confirm_probability)
     return _bayes(parameters.birth_probability, min(doubt, 0.0) + math.log(share))

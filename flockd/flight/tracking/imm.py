@@ -126,7 +126,7 @@ def predicted(
         way_s, displacement, sigma_m = 0.0 * way_s, np.zeros(3), p.relative_speed_sigma_m_s * math.sqrt(dt)
     else:
         target[0], displacement, sigma_m = own_displacement / dt, own_displacement, own_displacement_sigma_m
-        alike_s = 2 * p.relative_speed_sigma_m_s**2 / density[0]  # a mate's velocity differs by as much in the end
+        alike_s = 2 * p.relative_speed_sigma_m_s**2 / density[0]  # a mate's velocity differs by this sigma in the end
         kept[:, 0] = math.exp(-dt / alike_s)
         way_s[:, 0] = alike_s * (1.0 - kept[:, 0])
         squared_speed = (mean[:, 2, 3:6] ** 2).sum(axis=-1) + np.einsum("nxx->n", covariance[:, 2, 3:6, 3:6])

@@ -195,7 +195,7 @@ class Tracker:
         track.agreed += weight * track.agrees * track.share
         if track.confirmed:
             self._remember(measurement, weight)
-        persists = (1.0 - before) * (1.0 - track.share)  # false ones are vague, this one and the last
+        persists = (1.0 - before) * (1.0 - track.share)  # both detections are likely false if both are vague
         track.existence = existence.detected(track.existence, log_likelihood, weight, self.parameters, persists)
         track.drone_probability = existence.averaged(
             track.drone_probability, measurement.drone_probability, track.hits, interval_s, self.parameters
@@ -251,7 +251,7 @@ class Tracker:
     def _is_kept(self, track: _Track) -> bool:
         known_s = track.last_seen_s - track.first_seen_s
         longest_s = max(self.parameters.max_unseen_s, _UNSEEN_SHARE * known_s)
-        least = self.parameters.drop_probability * track.share  # the next detections of one that is only vague tell
+        least = self.parameters.drop_probability * track.share  # a vague track is kept until more detections tell
         return track.missing_s <= longest_s + JITTER_S and track.existence >= least
 
 
