@@ -73,7 +73,7 @@ class AutopilotStatus:
     home_ned: FloatArray | None
     """(3,) metres from the same origin."""
     foreign_setpoints: str | None = None
-    """Evidence of setpoints that flockd did not send, in a few words; None: none."""
+    """Evidence of setpoints that flockd did not send, in a few words; None: there is none."""
     fastest_m_s: float = math.inf
     """The autopilot's speed limit for setpoints; infinite if it is not known."""
     parameter_fault: str | None = None

@@ -73,9 +73,9 @@ LONGEST_DELAY_S = 1.0
 RESTARTED_MS = 1000
 """A stamp that goes back by this much comes from a restarted clock."""
 OTHER_CLOCK_MS, CLOCK_STAMPS, CLOCK_RETURNS = 100, 50, 3
-"""Two autopilots of one id: so many of the last stamps are so much older than the stamp before, as the stamps of two
-clocks take turns. A restart goes back once, packets of one autopilot that overtake each other by less, and those that
-come over a second, slower way too have stamps that were there before."""
+"""Two autopilots have one id if, of the last 50 stamps, 3 are 100 ms or more older than the stamp before: the stamps of
+two clocks alternate. Stamps go back only once at a restart, and by less if packets of one autopilot overtake each
+other. Packets that arrive over a second, slower way too have stamps that were received before."""
 MAV_SEVERITY_WARNING = 4
 TEXTS_KEPT = 20
 TEXT_MEMORY_S = 10.0
@@ -265,7 +265,7 @@ class ReceivedMessages:
         return None if self._stamps.lies else self.clock.estimate
 
     def _stamped_s(self, name: str, fields: Fields, arrived_s: float) -> float:
-        """When it was true on this computer's clock: by the autopilot's stamp, else when it came."""
+        """Time of validity on this computer's clock, by the autopilot's stamp; else the time of arrival."""
         clock, boot_ms = self.clock.estimate, fields.get("time_boot_ms")
         if boot_ms is None:
             return arrived_s

@@ -502,7 +502,7 @@ def _configuration(system_id: int | None) -> Configuration:
 
 
 def _refuse_a_taken_port(address: str) -> None:
-    """Refuses a UDP port in use: two programs can share one without an error, and both would command the drone."""
+    """Raises AutopilotError for a UDP port in use: two programs can share it, and both would command the drone."""
     kind, _, rest = address.partition("://")
     if kind != "udpin":
         return

@@ -160,7 +160,7 @@ read its checks in a ground station, or the messages before this one
   commander_arm_denied_resolve_failures: its checks before the flight fail
   unknown_check: a check fails that flockd has no words for
 """
-"""A remedy, and below it what is the matter, by name; names of PX4's without words say it themselves."""
+"""Each remedy, followed by the reasons that it mends: name and words. PX4's names without words explain themselves."""
 
 
 def _reasons() -> dict[str, Reason]:
@@ -193,7 +193,7 @@ REMEDIES_OF_RESULTS: Mapping[int, str] = {
     6: "ask again",
     10: "release the control in the ground station that has it",
 }
-"""By MAV_RESULT, where the autopilot says nothing else."""
+"""By MAV_RESULT, if the autopilot gives no other reason."""
 
 NAVIGATION_STATES: Mapping[FlightMode, int] = {
     "manual": 0,

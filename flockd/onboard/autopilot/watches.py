@@ -75,7 +75,7 @@ class SetpointWatch:
         self._sent: deque[tuple[float, float, float]] = deque(maxlen=200)
         self._foreign: deque[bool] = deque(maxlen=WINDOW)
         self.seen: str | None = None
-        """Evidence of another sender's setpoints in the last seconds, in a few words; None: none."""
+        """Evidence of another sender's setpoints in the last seconds; None: there is none."""
 
     def sent(self, time_s: float, north_m_s: float, east_m_s: float) -> None:
         """Takes a setpoint that flockd has sent."""

@@ -41,7 +41,7 @@ from flockd.onboard.telemetry.topics import AboutMessage
 from flockd.onboard.worker import BusyError, LateError, Worker
 
 LOAD_S = 60.0
-"""Time to load the networks, from a slow card too."""
+"""Time-out for loading the networks, from a slow card too."""
 OPEN_S = 10.0
 CLOSE_S = 3.0
 HOLD_S = 1.5

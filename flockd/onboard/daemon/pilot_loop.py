@@ -260,7 +260,7 @@ class Reports:
 
 
 _OVER = {ReasonKind.HEIGHT: "the range finder works again", ReasonKind.LENS: "its lens is clear again"}
-"""Said, after its subject, when a fault has ended."""
+"""Reported, after the fault's subject, when a fault has ended."""
 
 
 HISTORY_S = services.VEHICLE_STATE.timeout

@@ -196,7 +196,7 @@ SAMPLE_S = 0.05
 MEMORY_S = 1.0
 THERMAL_ZONES = Path("/sys/class/thermal")
 READ_EVERY_S = 1.0
-"""Time between two readings of the temperature, and for one."""
+"""Time between two readings of the temperature, and time-out of one."""
 
 
 class LoopLag:

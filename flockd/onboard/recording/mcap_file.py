@@ -38,7 +38,7 @@ _OTHERS = {
     b"\x28\xb5\x2f\xfd": "but packed by zstd); unpack it with `unzstd`",
     b"\x1f\x8b": "but packed by gzip); unpack it with `gunzip`",
 }
-"""How other files begin that are taken for recordings."""
+"""First bytes of files that are mistaken for recordings, and what they are."""
 _HEAD = struct.Struct("<BQ")
 MAX_RECORD_BYTES = 256 << 20
 """Largest record, and chunk uncompressed; larger ones count as damaged. The largest real ones hold one image."""

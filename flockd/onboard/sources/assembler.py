@@ -227,7 +227,7 @@ class FrameReceiver:
                 self._assembler.count(camera, one)
 
     def refuse(self, camera: str, what: Count, sentence: str) -> None:
-        """Counts an unusable frame. After `_USELESS_AFTER` in a row ``sentence`` becomes the camera's fault."""
+        """Counts an unusable frame. After `_USELESS_AFTER` in a row, ``sentence`` becomes the camera's fault."""
         with self._changed:
             self._assembler.count(camera, "received")
             self._assembler.count(camera, what)

@@ -17,7 +17,7 @@ from flockd.core.config.base import Endpoint
 from flockd.core.errors import ExitCode, FlockdError, UnavailableError
 
 MOST_REASON = 200
-"""Characters of zenoh's own words in an error."""
+"""Largest number of characters quoted from zenoh in an error."""
 _ENDPOINT: TypeAdapter[str] = TypeAdapter(Endpoint)
 _log = logging.getLogger(__name__)
 
