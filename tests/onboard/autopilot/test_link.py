@@ -37,7 +37,7 @@ from flockd.sim.scenario import RangeFinderConfig
 from flockd.sim.sitl.ground_station import GroundStation
 from flockd.sim.sitl.processes import free_port
 from tests.calm import clock
-from tests.onboard.autopilot.conftest import HEARTBEAT_S
+from tests.onboard.autopilot.conftest import HEARTBEAT_S, HOVER_M
 from tests.onboard.autopilot.flight import Wire, attended, flying, until
 
 
@@ -199,14 +199,20 @@ async def test_the_vehicle_follows_the_velocity_and_holds_its_own_height(
 
 
 async def test_without_a_new_position_the_vehicle_sinks_no_farther(address: str, fake_autopilot: FakeAutopilot) -> None:
-    """By its last position it would be above the height asked for, and sink, for ever."""
-    async with flying(address, Wanted(np.zeros(2), np.zeros(2), yaw_rad=0.0, height_m=0.5)) as flight:
-        await flight.enter_offboard()
-        await until(lambda: -fake_autopilot.state.position[2] < 2.0)
+    """By its last position it would be above the height asked for, and sink, for ever.
+
+    It stays in Hold: what is asked of it counts, as in a late setpoint stream it would go on with the last one.
+    """
+
+    def sink_m_s() -> float:
+        link.send_setpoint(Setpoint(0.0, np.zeros(2), 0.5, 0.0))
+        return fake_autopilot.setpoints[-1][1].sink_m_s if fake_autopilot.setpoints else math.nan
+
+    async with attended(address) as link:
+        await until(lambda: link.vehicle_state() is not None)
+        await until(lambda: sink_m_s() == pytest.approx(HOVER_M - 0.5, abs=0.1))
         fake_autopilot.sends_motion = False
-        await asyncio.sleep(3.0)
-        assert -fake_autopilot.state.position[2] > 0.4
-        assert abs(fake_autopilot.state.velocity[2]) < 0.1
+        await until(lambda: sink_m_s() == 0.0)
 
 
 async def test_a_setpoint_that_is_not_finite_never_leaves(address: str, fake_autopilot: FakeAutopilot) -> None:
