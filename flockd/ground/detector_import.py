@@ -73,6 +73,8 @@ def import_detector(file: Path, drone: str, licence: str | None, folder: Path, *
         raise UsageError(f"{file}: does not say the licence of its weights; write it with --licence{found}")
     name = re.sub("[^a-z0-9_-]", "_", file.stem.lower())
     targets = [folder / f"{name}{suffix}" for suffix in (".onnx", ".yaml")]
+    if folder.exists() and not folder.is_dir():
+        raise UsageError(f"{folder}: is a file; name a folder with --out")
     for target in targets:
         if target.resolve() == file.resolve():
             raise UsageError(f"{target}: is the file itself; name another folder with --out")
@@ -128,10 +130,17 @@ def _read(file: Path) -> onnx.ModelProto:
         return onnx.shape_inference.infer_shapes(model)
     except OSError as error:
         raise ModelError(f"{file}: cannot be read ({error.strerror}); name the ONNX file") from None
-    except (DecodeError, onnx.checker.ValidationError, onnx.shape_inference.InferenceError):
+    except (DecodeError, onnx.checker.ValidationError, onnx.shape_inference.InferenceError) as error:
         if file.read_bytes().startswith(LFS_POINTER):
             raise ModelError(f"{file}: is a pointer of Git LFS; fetch the file with `git lfs pull`") from None
+        if re.search("ir_version .* higher|should be stored in", told := str(error).splitlines()[0]):
+            raise _not_here(file, told) from None
         raise ModelError(f"{file}: is no ONNX file, or a damaged one; export it again as ONNX") from None
+
+
+def _not_here(file: Path, told: str) -> ModelError:
+    """Of a whole file that cannot be opened here."""
+    return ModelError(f"{file}: {told.rstrip('.')}; export it again into one file, for an older version (opset=17)")
 
 
 def _shape(tensor: onnx.ValueInfoProto) -> list[int | str]:
@@ -180,10 +189,10 @@ def _class_names(said: dict[str, str]) -> dict[int, str]:
     """The classes as Ultralytics writes them into the file: {0: 'drone'}, or ['drone']."""
     try:
         names = ast.literal_eval(said.get("names", "{}"))
+        pairs = enumerate(names) if isinstance(names, list) else names.items() if isinstance(names, dict) else ()
+        return {int(number): str(name) for number, name in pairs}
     except (ValueError, SyntaxError):
         return {}
-    pairs = enumerate(names) if isinstance(names, list) else names.items() if isinstance(names, dict) else ()
-    return {int(number): str(name) for number, name in pairs}
 
 
 def _class_number(file: Path, drone: str, names: dict[int, str], classes: int | None) -> int:
@@ -287,7 +296,10 @@ def _manifest(file: Path, kind: _Kind, name: str, drone: str, licence: str, said
 def _checked(file: Path, manifest: dict[str, Any], there: Path) -> dict[str, NDArray[Any]]:
     """The output for the golden image. Raises ModelError if it is impossible for this kind of network."""
     opened = read_manifest(write_unchecked(manifest, there))
-    runtime = open_runtime(opened, threads=1, provider="cpu", folder=None)
+    try:
+        runtime = open_runtime(opened, threads=1, provider="cpu", folder=None)
+    except ModelError as error:
+        raise _not_here(file, "cannot be loaded by this onnxruntime") from error
     try:
         (boxes,) = runtime.run(["boxes"], golden_feeds(opened.manifest))
     except Exception as error:  # noqa: BLE001 - the library's own exception types are private

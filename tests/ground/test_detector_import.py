@@ -12,6 +12,7 @@ import onnx
 import pytest
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
+from onnx.external_data_helper import convert_model_to_external_data
 
 from flockd.cli import main
 from flockd.flight.inference import OnnxModel
@@ -156,6 +157,7 @@ def test_an_imported_detector_detects(tmp_path: Path, capsys: pytest.CaptureFixt
     ("output", "options", "said", "code", "sentence"),
     [
         (yolov8(), {"drone": "uav"}, AGPL, 2, "has no class 'uav' but has bird, drone; write --drone with a name, or"),
+        (yolov8(), {}, {"names": "{'a': 'drone'}"}, 2, "no class 'drone' but does not name its classes; write --drone"),
         (yolov8(), {"drone": "2"}, {}, 2, "no class '2' but does not name its classes; write --drone with a name, or"),
         (yolov8(), {"licence": ""}, AGPL, 2, "write it with --licence (the file says 'AGPL-3.0 License"),
         (yolov8(), {}, {"task": "segment", **AGPL}, 78, "is a network for the task 'segment'; export one that detects"),
@@ -164,7 +166,7 @@ def test_an_imported_detector_detects(tmp_path: Path, capsys: pytest.CaptureFixt
         (yolov8() / np.float32(SIDE), {}, AGPL, 78, "boxes around 0.781, which are not pixels of its input"),
         (yolov8() * np.float32(np.inf), {}, AGPL, 78, "gives numbers that are not finite"),
     ],
-    ids=["name", "number", "licence", "task", "shape", "scores", "shares", "infinite"],
+    ids=["name", "names", "number", "licence", "task", "shape", "scores", "shares", "infinite"],
 )
 def test_what_cannot_be_imported_is_said_in_one_sentence(
     output: Any, options: dict[str, str], said: dict[str, str], code: int, sentence: str, tmp_path: Path,
@@ -191,6 +193,28 @@ def test_free_sizes_and_other_layouts_are_refused(
     output = yolov8() if shape[0] == 1 else np.repeat(yolov8(), 4, axis=0)
     assert imported(written(tmp_path / "best.onnx", output, image=image, shape=shape, said=AGPL)) == 78
     assert sentence in capsys.readouterr().err
+
+
+def test_a_whole_file_that_cannot_be_opened_here_is_not_called_damaged(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = written(tmp_path / "best.onnx", yolov8(), said=AGPL)
+    for change, told in (
+        (lambda model: setattr(model, "ir_version", 99), "Your model ir_version 99 is higher than"),
+        (
+            lambda model: setattr(model.opset_import[0], "version", 99),
+            "best.onnx: cannot be loaded by this onnxruntime",
+        ),
+        (lambda model: convert_model_to_external_data(model, size_threshold=0), "should be stored in"),
+    ):
+        model = onnx.load(file)
+        change(model)  # type: ignore[no-untyped-call]
+        (tmp_path / "changed").mkdir(exist_ok=True)
+        (tmp_path / "changed" / "best.onnx").write_bytes(model.SerializeToString())
+        assert imported(tmp_path / "changed" / "best.onnx") == 78
+        said = capsys.readouterr().err
+        assert told in said
+        assert "; export it again into one file, for an older version (opset=17)\n" in said
 
 
 def test_what_is_no_onnx_file_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

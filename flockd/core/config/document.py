@@ -65,6 +65,11 @@ def read_document(path: Path, what: str = "configuration") -> Document:
     text = _read_text(path, what)
     if _CALIBRATION.search(text):
         raise ConfigError.at(path, "is another program's calibration; `flockd calibrate import FILE` gives its lenses")
+    return document_of(text, path, what)
+
+
+def document_of(text: str, path: Path, what: str) -> Document:
+    """The document of a file's text, as `read_document` reads it."""
     try:
         top = _Loader(text, str(path), what).get_single_node()
     except yaml.MarkedYAMLError as error:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import threading
 from bisect import bisect, insort
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -76,8 +78,12 @@ def vehicle_state(kind: str, message: Any, time_s: float) -> VehicleState | None
     """
     if kind in {PX4_ODOMETRY, PX4_ATTITUDE}:
         return _px4_state(kind, message, time_s)
-    if message.header.frame_id.endswith("_ned") or getattr(message, "child_frame_id", "").endswith("_frd"):
+    axes = f"{message.header.frame_id} {getattr(message, 'child_frame_id', '')}".lower()
+    if re.search(r"(^|[_/])ned | (.*[_/])?frd$", axes):
         return None  # as MAVROS names PX4's axes
+    unknown = {IMU: "orientation_covariance", ODOMETRY: "pose.covariance"}.get(kind)
+    if unknown is not None and attrgetter(unknown)(message)[0] < 0:
+        return None
     pose = message.pose.pose if kind == ODOMETRY else message.pose if kind == POSE else message
     try:
         R_ned_body = attitude_of_ros(rotation_of(_values(pose.orientation, "xyzw")))
@@ -90,6 +96,7 @@ def vehicle_state(kind: str, message: Any, time_s: float) -> VehicleState | None
         return None
     if kind == ODOMETRY and message.twist.covariance[0] >= 0:
         velocity = R_ned_body @ frd_of_flu(_values(message.twist.twist.linear, "xyz"))
+        velocity = velocity if np.isfinite(velocity).all() else None
     return VehicleState(time_s, R_ned_body, -float(place[2]), velocity, place[:2])
 
 

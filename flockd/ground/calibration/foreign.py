@@ -13,11 +13,12 @@ from typing import Any
 
 import cv2
 import numpy as np
-import yaml
 from pydantic import ValidationError
 
 from flockd.core.choices import LensModel
+from flockd.core.config.document import document_of
 from flockd.core.config.rig import CameraConfig, IntrinsicsConfig
+from flockd.core.errors import ConfigError
 from flockd.ground.calibration.board import CENTRE_PX, CalibrationError
 from flockd.ground.calibration.fragment import measured_today
 from flockd.ground.calibration.nearest_lens import DISTORTIONS, ForeignLens, nearest_lens
@@ -45,6 +46,7 @@ _COLMAP: Mapping[str, tuple[str, str]] = {
 """The distortion of each model, and the names of its parameters."""
 _KALIBR = {"pinhole": "", "omni": "xi", "ds": "xi alpha", "eucm": "alpha beta"}
 """Names of the parameters before fx, fy, cx, cy."""
+_GIVE = "give Kalibr's camchain, ROS's camera_info, OpenCV's FileStorage or COLMAP's cameras.txt"
 
 
 def foreign_lenses(file: Path, size: tuple[int, int] | None) -> list[ForeignLens]:
@@ -54,17 +56,17 @@ def foreign_lenses(file: Path, size: tuple[int, int] | None) -> list[ForeignLens
     """
     try:
         found = _read(file, size)
-    except cv2.error as error:
+    except (cv2.error, SystemError) as error:  # SystemError: of XML that is cut
         raise CalibrationError(f"{file}: OpenCV cannot read it; write it again with cv2.FileStorage") from error
     except UnicodeDecodeError as error:
         raise CalibrationError(f"{file}: is not text; name the file of a calibration") from error
-    except (OSError, yaml.YAMLError) as error:
-        raise CalibrationError(f"{file}: cannot be read ({str(error).splitlines()[0]}); use another copy") from error
+    except OSError as error:
+        raise CalibrationError(f"{file}: cannot be read ({error.strerror}); use another copy") from error
+    except ConfigError as error:
+        raise CalibrationError(f"{error.problems[0]}, or {_GIVE}") from error
     except (KeyError, ValueError, TypeError, AttributeError) as error:
-        told = f"{file}: lacks or garbles {error}"
-        raise CalibrationError(
-            f"{told}; give Kalibr's camchain, ROS's camera_info, OpenCV's FileStorage or COLMAP's cameras.txt"
-        ) from error
+        told = str(error).replace("could not convert string to float:", "the number")
+        raise CalibrationError(f"{file}: lacks or garbles {told}; {_GIVE}") from error
     for lens in found:
         if size not in {None, lens.size}:
             told = f"is of {lens.size[0]} x {lens.size[1]} images, and --size is another; leave it out"
@@ -83,13 +85,12 @@ def _read(file: Path, size: tuple[int, int] | None) -> list[ForeignLens]:
         return [_of_colmap(line.split()) for line in text.splitlines() if re.match(r"\s*\d", line)]
     if text.startswith("%YAML:1") or "opencv-matrix" in text or "opencv_storage" in text:
         return [_of_matrices(values, name, size) for name, values in _opencv(file)]
-    values, *others = [one for one in yaml.safe_load_all(text) if one is not None] or [None]
-    if others:
-        raise CalibrationError(f"{file}: holds {1 + len(others)} documents; write each to a file of its own")
-    if isinstance(values, dict) and {"width", "height"} <= values.keys():
+    document = document_of(re.sub(r"\n---\s*$", "\n", text), file, "calibration")
+    if document.problems:
+        raise CalibrationError(str(document.problems[0]))
+    values: Mapping[str, Any] = document.values
+    if {"width", "height"} <= values.keys():
         values = {_ECHOED.get(key.lower(), key): one for key, one in values.items()}
-    if not isinstance(values, dict):
-        raise ValueError("keys with values")  # noqa: TRY004 - told as what else is wrong with a file
     if "rig" in values:
         raise CalibrationError(f"{file}: is a drone's own file; copy the cameras of its `rig`, they need no import")
     if "camera_matrix" in values:
@@ -153,6 +154,8 @@ def _of_matrices(values: Mapping[str, Any], name: str, size: tuple[int, int] | N
     if matrix.size != 9 or not matrix.any():
         raise ValueError(f"the camera_matrix, {matrix.size} numbers{'' if matrix.any() else ' that are 0'}")
     matrix = matrix.reshape(3, 3)
+    if [*matrix[2], matrix[1, 0]] != [0.0, 0.0, 1.0, 0.0]:
+        raise ValueError("the camera_matrix, whose rows are fx s cx, 0 fy cy and 0 0 1")
     if "distortion_coefficients" not in values:
         raise ValueError("the distortion, as distortion_coefficients or D; zeros if there is none")
     distortion = _data(values["distortion_coefficients"])

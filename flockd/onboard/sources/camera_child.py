@@ -40,8 +40,8 @@ NOT_INSTALLED, NO_ROS = "GStreamer is not installed", "there is no rclpy"
 IMAGES = {"sensor_msgs/msg/Image": (IMAGE, "Image"), "sensor_msgs/msg/CompressedImage": (COMPRESSED, "CompressedImage")}
 IMAGE_HEAD = struct.Struct("<64sIII")
 """Encoding or format; width, height and bytes per line of an Image."""
-INFO_BODY = struct.Struct("<II4d")
-"""Width, height; fx, fy, cx, cy."""
+INFO_BODY = struct.Struct("<II9d?")
+"""See `numbers_of`."""
 
 _END_S = 1.0
 """Time for a pipeline to close its camera."""
@@ -327,8 +327,14 @@ def packed(message: Any) -> bytes:
 
 def body_of(info: Any) -> bytes:
     """The data of an `info` message."""
+    return INFO_BODY.pack(*numbers_of(info))
+
+
+def numbers_of(info: Any) -> tuple[float, ...]:
+    """Width, height; fx, fy, cx, cy; five coefficients, NaN for more; whether they are of a fisheye."""
     fx, _, cx, _, fy, cy, *_ = info.k
-    return INFO_BODY.pack(info.width, info.height, fx, fy, cx, cy)
+    k = [float("nan")] * 5 if len(info.d) > 5 else [*info.d, *[0.0] * (5 - len(info.d))]
+    return info.width, info.height, fx, fy, cx, cy, *k, info.distortion_model in {"equidistant", "fisheye"}
 
 
 def _wait_for(node: Any, topic: str) -> tuple[bytes, str, bool]:

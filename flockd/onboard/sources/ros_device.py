@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from flockd.core.config.rig import IntrinsicsConfig
+from flockd.core.config.rig import IntrinsicsConfig, field_of_view_deg
 from flockd.core.config.source import CameraDeviceParameters
 from flockd.onboard.sources.camera_child import COMPRESSED, IMAGE, IMAGE_HEAD, INFO, INFO_BODY, NO_ROS
 from flockd.onboard.sources.child_device import ROS_CHILD, ChildDevice, ChildMessage
@@ -63,22 +63,25 @@ def ros_format(
     return PackedFormat(ENCODINGS[encoding], wanted, bytes_per_line)
 
 
-def info_fault(
-    lens: IntrinsicsConfig, wanted: tuple[int, int], size: tuple[int, int], found: tuple[float, float, float, float]
-) -> str | None:
-    """How a CameraInfo contradicts the rig, by its ``size`` or fx, fy, cx and cy; None: it agrees, or is uncalibrated.
+def info_fault(lens: IntrinsicsConfig, wanted: tuple[int, int], topic: str, found: Sequence[float]) -> str | None:
+    """How a CameraInfo contradicts the rig; None: it agrees, or is uncalibrated.
 
-    Pixel centres are at whole numbers in ROS.
+    ``topic``: of the images; rectified ones have the CameraInfo of those before. ``found``: see `numbers_of`. Pixel
+    centres are at whole numbers in ROS.
     """
-    fx, fy, cx, cy = found
+    width, height, fx, fy, cx, cy, *k, fisheye = found
     if fx == 0:
         return None
-    if size != wanted:
-        return f"is of {size[0]}x{size[1]}, but the rig has {wanted[0]}x{wanted[1]}; correct one"
+    if (width, height) != wanted:
+        return f"is of {width}x{height}, but the rig has {wanted[0]}x{wanted[1]}; correct one"
     for key, value in {"fx": fx, "fy": fy, "cx": cx + CENTRE_PX, "cy": cy + CENTRE_PX}.items():
         expected = getattr(lens, key)
         if not abs(value - expected) <= LENS_TOLERANCE * lens.fx:
             return f"has {key} {value:.1f}, but the rig {expected:.1f}; correct one"
+    kind = {"model": "wide_angle", "distortion": k[:4]} if fisheye else {"model": "pinhole", "distortion": k}
+    seen, expected = (field_of_view_deg(one, wanted) for one in (lens.model_copy(update={**kind, "fx": fx}), lens))
+    if "rect" not in topic and abs(seen - expected) > LENS_TOLERANCE * expected:
+        return f"shows {seen:.0f} degrees by its D, but the rig {expected:.0f}; correct one"
     return None
 
 
@@ -101,7 +104,7 @@ class RosDevice(ChildDevice):
 
     def _taken(self, message: ChildMessage) -> CapturedBuffer | None:
         if message.kind == INFO:
-            self._compare(*INFO_BODY.unpack(message.data))
+            self._compare(INFO_BODY.unpack(message.data))
             return None
         text, width, height, bytes_per_line = IMAGE_HEAD.unpack_from(message.data)
         encoding = text.rstrip(b"\0").decode("utf-8", "replace")
@@ -112,12 +115,11 @@ class RosDevice(ChildDevice):
             raise CameraError(f"{self._name}: {self._topic} {error}") from None
         return self._captured(message.data[IMAGE_HEAD.size :], message)
 
-    def _compare(self, width: int, height: int, fx: float, fy: float, cx: float, cy: float) -> None:
+    def _compare(self, numbers: Sequence[float]) -> None:
         """Raises CameraError if a calibrated CameraInfo contradicts the rig."""
         if self._lens is None:
             return
-        fault = info_fault(self._lens, self._size, (width, height), (fx, fy, cx, cy))
-        if fault is not None:
+        if (fault := info_fault(self._lens, self._size, self._topic, numbers)) is not None:
             raise CameraError(f"{self._name}: {self._info_topic} {fault}")
 
     def _failed(self, reason: str) -> CameraError:

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple, Self
 
 import cv2
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 
 from flockd.core.choices import ImageFormat
 from flockd.core.config import DroneConfig
@@ -52,6 +53,7 @@ from flockd.onboard.recording.streams import (
 )
 from flockd.onboard.sources import image_formats
 from flockd.onboard.sources.assembler import Assembler, RawFrameSet
+from flockd.onboard.sources.camera_child import numbers_of
 from flockd.onboard.sources.device_source import frames_of
 from flockd.onboard.sources.frames import CapturedBuffer
 from flockd.onboard.sources.image_formats import CorruptImageError, MjpegFormat
@@ -134,9 +136,7 @@ def _compare_lenses(bag: Bag, config: DroneConfig, kinds: Mapping[str, str]) -> 
         topic = camera.camera_info or info_topic_of(camera.place)
         if kinds.get(topic) != CAMERA_INFO or (message := next(bag.messages([topic]), None)) is None:
             continue
-        info, (lens, wanted) = bag.read(message), lenses[camera.name]
-        found = float(info.k[0]), float(info.k[4]), float(info.k[2]), float(info.k[5])
-        if (fault := info_fault(lens, wanted, (info.width, info.height), found)) is not None:
+        if (fault := info_fault(*lenses[camera.name], camera.place, numbers_of(bag.read(message)))) is not None:
             raise RecordingError(f"{bag.path}: camera {camera.name}: {topic} {fault}")
 
 
@@ -233,24 +233,61 @@ class _PngFormat:
 def _states(bag: Bag, topic: str, config: DroneConfig, began_ns: int, tell: Callable[[str], None]) -> NearestState:
     """All states of the vehicle in the bag."""
     check_height(f"{bag.path}: {topic}", bag.kinds()[topic], config)
-    states, on_arrival, count, unusable = NearestState(kept=None), False, 0, 0
+    states, on_arrival, count, unusable, usable = NearestState(kept=None), False, 0, 0, list[VehicleState]()
     for message in bag.messages([topic]):
         content = bag.read(message)
         stamp, own_clock = state_stamp_ns(message.kind, content, message.time_ns)
         on_arrival |= own_clock
         state = vehicle_state(message.kind, content, _time_s(stamp, began_ns))
         states.add(state)
+        usable += [state] if state is not None else []
         count, unusable = count + 1, unusable + (state is None)
     if unusable:
         told = f"{bag.path}: {unusable} of {count} states of {topic} have no attitude or place in ENU and FLU"
         if unusable == count:
             raise RecordingError(f"{told}; name another topic with --vehicle")
         tell(told)
+    if (fault := _contradiction(usable, config)) is not None:
+        raise RecordingError(f"{bag.path}: {topic} {fault}")
     if on_arrival:
         tell(
             f"{bag.path}: stamps of {topic} are of the autopilot's own clock; the times at which it was recorded count"
         )
     return states
+
+
+def _contradiction(states: Sequence[VehicleState], config: DroneConfig) -> str | None:
+    """Why odometry cannot be in metres, with z up, and with velocities of the body; None: it can."""
+    if config.perception.scale == "height" and states and max(one.height_m for one in states) <= 0.0:
+        told = "is never above 0 m, and perception.scale is `height`"
+        return f"{told}; give heights with z up, or set perception.scale to `network`"
+    if states and np.median([one.R_ned_body[2, 2] for one in states]) < _UPRIGHT:
+        return "has the drone on its side, or upside down; give attitudes in the order x, y, z, w"
+    known = ((one.time_s, one.position, one.velocity_ned) for one in states)
+    both = [(time_s, place, v[:2]) for time_s, place, v in known if place is not None and v is not None]
+    if not both:
+        return None
+    times_s, places, velocities = (np.array(part, np.float64) for part in zip(*both, strict=True))
+    ways = cumulative_trapezoid(velocities, times_s, axis=0, initial=0)
+    last = np.searchsorted(times_s, times_s + _APART_S)
+    inside = np.append(times_s, np.inf)[last] < times_s + 2 * _APART_S  # of the recording, and without a longer gap
+    first = np.flatnonzero(inside)
+    last = last[first]
+    moved, said = ((of[last] - of[first]) / (times_s[last] - times_s[first])[:, None] for of in (places, ways))
+    off = np.linalg.norm(moved - said, axis=1) - 0.5 * np.linalg.norm([moved, said], axis=2).max(axis=0)
+    if not len(first) or np.median(off) <= _OFF_M_S:
+        return None
+    speeds = (float(np.median(np.linalg.norm(of, axis=1))) for of in (said, moved))
+    return (
+        "says {:.1f} m/s, and its positions move by {:.1f} m/s, or another way; give metres, velocities of the body "
+        "(FLU), and attitudes in the order x, y, z, w".format(*speeds)
+    )
+
+
+_APART_S, _UPRIGHT = 0.5, 0.5
+"""Time between positions; and the cosine of the lean beyond which half a flight is not flown."""
+_OFF_M_S = 0.5
+"""Odometry may err by that, or by half its speed, before it contradicts itself."""
 
 
 def _vehicle_topic(bag: Bag, wanted: str | None) -> str:
@@ -329,6 +366,8 @@ class Bag:
             told = f"is not a readable bag ({error}); use another copy"
             if "metadata" in str(error):
                 told = f"its metadata.yaml is not whole; write it again with `ros2 bag reindex {folder}`"
+            if "magic" in str(error):
+                told = "its MCAP file has no end, as of a recorder that was killed; `mcap recover` keeps what is whole"
             raise RecordingError(f"{folder}: {told}") from error
 
     def __enter__(self) -> Self:

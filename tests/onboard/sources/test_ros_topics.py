@@ -36,8 +36,9 @@ def compressed(form: str, data: bytes) -> bytes:
     return packed(SimpleNamespace(format=form, data=data))
 
 
-def info(fx: float = 50.0, cx: float = 31.5, size: tuple[int, int] = SIZE) -> bytes:
-    return body_of(SimpleNamespace(width=size[0], height=size[1], k=[fx, 0.0, cx, 0.0, fx, 23.5, 0.0, 0.0, 1.0]))
+def info(fx: float = 50.0, cx: float = 31.5, size: tuple[int, int] = SIZE, d: tuple[float, ...] = ()) -> bytes:
+    k = [fx, 0.0, cx, 0.0, fx, 23.5, 0.0, 0.0, 1.0]
+    return body_of(SimpleNamespace(width=size[0], height=size[1], k=k, d=d, distortion_model="plumb_bob"))
 
 
 @pytest.mark.parametrize(
@@ -122,6 +123,10 @@ def test_what_is_worth_nothing_is_counted_and_the_next_is_fine(start: Watch, mes
         (("jpeg", compressed("png", b"x")), "/front/image_raw sends 'png'; let its transport send JPEG"),
         (("info", info(fx=80.0)), "/front/camera_info has fx 80.0, but the rig 50.0; correct one"),
         (("info", info(cx=10.0)), "/front/camera_info has cx 10.5, but the rig 32.0; correct one"),
+        (
+            ("info", info(d=(-0.3, 0.1, 0.0, 0.0))),
+            "/front/camera_info shows 73 degrees by its D, but the rig 65; correct",
+        ),
         (("info", info(size=(32, 48))), "/front/camera_info is of 32x48, but the rig has 64x48; correct one"),
         (("fail", b"is of std_msgs/msg/String"), "is of std_msgs/msg/String; name a topic of Image or CompressedImage"),
         (("fail", b"there is no rclpy"), "front: there is no rclpy; source a ROS 2, or, with Python 3.11 on x86-64"),

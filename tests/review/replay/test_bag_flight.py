@@ -89,12 +89,12 @@ def imu(time_ns: int) -> Any:
 ODOMETRY = "nav_msgs/msg/Odometry"
 
 
-def info(time_ns: int, focal_px: float) -> Any:
+def info(time_ns: int, focal_px: float, d: tuple[float, ...]) -> Any:
     """Pixel centres at whole numbers."""
     roi = kind("sensor_msgs/msg/RegionOfInterest")(0, 0, 0, 0, False)
     k = np.array([focal_px, 0.0, 31.5, 0.0, focal_px, 23.5, 0.0, 0.0, 1.0])
     return kind("sensor_msgs/msg/CameraInfo")(
-        header=header(time_ns), height=48, width=64, distortion_model="plumb_bob", d=np.zeros(5), k=k,
+        header=header(time_ns), height=48, width=64, distortion_model="plumb_bob", d=np.array(d), k=k,
         r=np.eye(3).ravel(), p=np.zeros(12), binning_x=0, binning_y=0, roi=roi,
     )  # fmt: skip
 
@@ -124,12 +124,13 @@ def bag(
     corner: tuple[int, int, int] | None = None,
     small: tuple[str, bytes] | None = None,
     focal_px: float | None = None,
+    d: tuple[float, ...] = (0.0,) * 5,
     spoil: Callable[[Any, int], Any] = lambda message, tick: message,
 ) -> Path:
     """A second of two cameras at 10 Hz, the second one 20 ms late, and states at 50 Hz.
 
-    ``corner``: BGR of the first one's first pixel; ``small``: format and data of the second one's images; ``focal_px``:
-    of the first one's CameraInfo; ``spoil``: of a state and its number, what is written; None: nothing.
+    ``corner``: BGR of the first one's first pixel; ``small``: format and data of the second one's images; ``focal_px``,
+    ``d``: of the first one's CameraInfo; ``spoil``: of a state and its number, what is written; None: nothing.
     """
     with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         connections: dict[str, Any] = {}
@@ -145,7 +146,7 @@ def bag(
                 place = np.array([1.0, 0.04 * tick, 3.0])
                 if states == PX4:
                     own_us = 20_000 * tick if topic == "/own" else time_ns // 1000
-                    message = px4_odometry(own_us, np.array([0.04 * tick, 1.0, -3.0]))
+                    message = px4_odometry(own_us, np.array([1.0, 0.04 * tick, -3.0]))
                 else:
                     message = odometry(time_ns, place) if "Odom" in states else imu(time_ns)
                 if (spoilt := spoil(message, tick)) is not None:
@@ -155,7 +156,7 @@ def bag(
                 if corner is not None:
                     front[0, 0] = corner[::-1]
                 if focal_px is not None:
-                    write("/front/camera_info", "sensor_msgs/msg/CameraInfo", time_ns, info(time_ns, focal_px))
+                    write("/front/camera_info", "sensor_msgs/msg/CameraInfo", time_ns, info(time_ns, focal_px, d))
                 image = kind("sensor_msgs/msg/Image")(
                     header=header(time_ns), height=48, width=64, encoding="bgr8", is_bigendian=0, step=192,
                     data=np.ascontiguousarray(front[..., ::-1]).ravel(),
@@ -249,6 +250,10 @@ JPEG = bytes(cv2.imencode(".jpg", np.random.default_rng(0).integers(0, 256, (96,
         ({"small": ("h264", b"\0\0\0\1")}, "/back/image_raw/compressed: sends 'h264'; let its transport send JPEG"),
         ({"small": ("16UC1; compressedDepth png", b"x")}, "sends '16UC1; compressedDepth png'"),
         ({"focal_px": 100.0}, "camera front: /front/camera_info has fx 100.0, but the rig 50.0; correct one"),
+        (
+            {"focal_px": 50.0, "d": (-0.3, 0.1, 0.0, 0.0)},
+            "/front/camera_info shows 73 degrees by its D, but the rig 65",
+        ),
     ],
 )
 def test_images_and_lenses_that_a_drone_would_refuse_are_refused(
@@ -279,13 +284,61 @@ def without_attitude(message: Any, tick: int) -> Any:
     return message
 
 
-@pytest.mark.parametrize("spoil", [in_ned, without_attitude])
+def of_unknown_attitude(message: Any, tick: int) -> Any:
+    """As REP-145 and the message's definition say it."""
+    message.pose.covariance[0] = -1.0
+    return message
+
+
+@pytest.mark.parametrize("spoil", [in_ned, without_attitude, of_unknown_attitude])
 def test_states_that_are_none_are_told_instead_of_their_clocks(
     tmp_path: Path, spoil: Callable[[Any, int], Any]
 ) -> None:
     theirs, config = bag(tmp_path / "bag", spoil=spoil), load_drone(config_file(tmp_path))
     told = "bag: 50 of 50 states of /odom have no attitude or place in ENU and FLU; name another topic"
     with Bag(theirs) as opened, pytest.raises(RecordingError, match=told):
+        recording_of_bag(opened, config, None, tmp_path / "flight.mcap")
+
+
+def in_other_axes(message: Any, tick: int) -> Any:
+    """Velocities of the world, not of the body, which faces north and flies there."""
+    message.twist.twist.linear.x, message.twist.twist.linear.y = 0.0, 2.0
+    return message
+
+
+def in_millimetres(message: Any, tick: int) -> Any:
+    message.pose.pose.position.y *= 1000.0
+    return message
+
+
+def w_first(message: Any, tick: int) -> Any:
+    turn = message.pose.pose.orientation
+    turn.x, turn.y, turn.z, turn.w = turn.w, turn.x, turn.y, turn.z
+    return message
+
+
+def on_the_ground(message: Any, tick: int) -> Any:
+    message.pose.pose.position.z = 0.0
+    return message
+
+
+@pytest.mark.parametrize(
+    ("spoil", "sentence"),
+    [
+        (
+            in_other_axes,
+            "/odom says 2.0 m/s, and its positions move by 2.0 m/s, or another way; give metres, velocities",
+        ),
+        (in_millimetres, "/odom says 2.0 m/s, and its positions move by 2000.0 m/s, or another way; give metres"),
+        (w_first, "/odom has the drone on its side, or upside down; give attitudes in the order x, y, z, w"),
+        (on_the_ground, "/odom is never above 0 m, and perception.scale is `height`; give heights"),
+    ],
+)
+def test_odometry_that_contradicts_itself_or_the_configuration_is_refused(
+    tmp_path: Path, spoil: Callable[[Any, int], Any], sentence: str
+) -> None:
+    config = load_drone(config_file(tmp_path, perception={"scale": "height"}))
+    with Bag(bag(tmp_path / "bag", spoil=spoil)) as opened, pytest.raises(RecordingError, match=re.escape(sentence)):
         recording_of_bag(opened, config, None, tmp_path / "flight.mcap")
 
 
@@ -347,7 +400,7 @@ def test_px4s_own_odometry_is_the_vehicles_state(topic: str, tmp_path: Path) -> 
     assert len(steps) == 5
     for number, step in enumerate(steps):
         assert (step.vehicle.position is not None, step.vehicle.velocity_ned is not None) == (True, True)
-        np.testing.assert_allclose(step.vehicle.position, [0.04 + 0.4 * number, 1.0], atol=1e-6)  # type: ignore[arg-type]
+        np.testing.assert_allclose(step.vehicle.position, [1.0, 0.04 + 0.4 * number], atol=1e-6)  # type: ignore[arg-type]
         np.testing.assert_allclose(step.vehicle.velocity_ned, [0.0, 2.0, 0.0], atol=1e-6)  # type: ignore[arg-type]
         np.testing.assert_allclose(step.vehicle.R_ned_body[:, 0], [0.0, 1.0, 0.0], atol=1e-6)
         assert step.vehicle.height_m == 3.0
