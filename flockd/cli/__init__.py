@@ -48,12 +48,12 @@ EXTRAS = {
 
 EXIT_CODES = """\
 exit codes:
-  0    done
+  0    done; also after Ctrl-C in what runs until then: run, fleet, status, ros, sim --live
   1    a check failed
   2    the command line is wrong, or a file that it names does not exist
   69   something is unavailable: an autopilot, a device, an optional package
   78   a configuration or a model is wrong
-  130  interrupted by Ctrl-C; a report of what was flown is written"""
+  130  interrupted by Ctrl-C; `sim` writes a report of what was flown, and `campaign` goes on later"""
 
 
 def installing(extra: str) -> str:
