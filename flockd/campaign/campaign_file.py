@@ -73,7 +73,7 @@ class CampaignConfig(Section):
 
     @model_validator(mode="after")
     def _says_nothing_twice(self) -> Self:
-        faults: dict[tuple[str | int, ...], str] = {}
+        faults = self._parts_beside_the_whole()
         of_cases = {key for values in self.cases.values() for key in values}
         for key, variation in self.vary.items():
             for number, value in enumerate(variation.values):
@@ -96,6 +96,14 @@ class CampaignConfig(Section):
                 faults["cases", case, "seed"] = "is set for each flight; write `seed` and `seeds` at the top level"
         refuse(self, faults)
         return self
+
+    def _parts_beside_the_whole(self) -> dict[tuple[str | int, ...], str]:
+        sets: dict[tuple[str, ...], Mapping[str, Any]] = {("fixed",): self.fixed, ("vary",): self.vary}
+        sets |= {("cases", case): values for case, values in self.cases.items()}
+        return {
+            (*place, key): f"is a part of {whole}, which stands here too; write it there"
+            for place, keys in sets.items() for key in keys for whole in keys if key.startswith(f"{whole}.")
+        }  # fmt: skip
 
 
 def load_campaign(path: Path | str) -> tuple[CampaignConfig, Mapping[KeyPath, Place]]:

@@ -93,6 +93,7 @@ class _Detected:
     proposals: int
     seconds: float
     has_colour: bool
+    is_blank: bool
 
 
 def _run(args: argparse.Namespace) -> int:
@@ -122,6 +123,8 @@ def _run(args: argparse.Namespace) -> int:
     say_facts(args, result)
     if copies is not None:
         complain(f"written: {copies.written} {'copy' if copies.written == 1 else 'copies'} in {args.out}")
+    if blank := result["blank"]:
+        complain(f"{blank} of {len(detected)} of one colour all over; uncover the lens, or give other pictures")
     if grey := result["without_colour"]:
         complain(
             f"{grey} of {len(detected)} without colour, as thermal and night cameras give them: the networks learnt "
@@ -197,8 +200,9 @@ def _detected(
                         seconds = time.perf_counter() - begin
                         if write is not None:
                             write(annotated(one.image, result))
-                        has_colour = bool(np.ptp(one.image[::8, ::8], axis=2).mean() >= _COLOUR)
-                        yield _Detected(picture, one, result.detections, result.proposals, seconds, has_colour)
+                        some = one.image[::8, ::8]
+                        looks = bool(np.ptp(some, axis=2).mean() >= _COLOUR), bool(np.ptp(some, axis=(0, 1)).max() < 1)
+                        yield _Detected(picture, one, result.detections, result.proposals, seconds, *looks)
                         done += 1
                         tell(done, max(done, count))
                 except DatasetError as error:
@@ -218,7 +222,8 @@ def _result(detected: Sequence[_Detected]) -> dict[str, Any]:
     count = max(len(detected), 1)
     return {
         "images": len(detected),
-        "without_colour": sum(not one.has_colour for one in detected),
+        "blank": sum(one.is_blank for one in detected),
+        "without_colour": sum(not (one.has_colour or one.is_blank) for one in detected),
         "pictures": [
             {
                 "file": one.picture.name,

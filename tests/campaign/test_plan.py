@@ -107,6 +107,10 @@ def test_a_plan_is_its_own_copy(tmp_path: Path) -> None:
         ),
         ("fixed:\n  vehicles.0: 4\n", "6: fixed.vehicles.0: `vehicles` is not a section"),
         ("measure: [collisions, collisions]\n", "5: measure[1]: collisions is named already; delete one"),
+        (
+            "cases: {a: {vehicle: {gust_m_s: 0.3}, vehicle.gust_m_s: 0.1}}\n",
+            "5: cases.a.vehicle.gust_m_s: is a part of vehicle, which stands here too; write it there",
+        ),
         ("cases: {a: {drones: 4}, b: {drones: 4}}\n", "5: cases.b: has the values of a; change them, or delete one"),
         ("fixed: {drones: 5.5}\n", "5: fixed.drones: must be whole numbers from 1 to 100"),
         (

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -93,7 +94,8 @@ def scored(pictures: Sequence[dict[str, Any]], labels: dict[Path, list[Box]]) ->
     """Score the labelled ones of ``pictures``, which are in the form of `flockd detect --json`.
 
     By box width the number of ``boxes`` and of those ``found``, with a detection's middle inside; ``ap50``, the average
-    precision at an intersection over union of 0.5; ``measured`` pictures; ``false``: detections that found no box.
+    precision at an intersection over union of 0.5; ``measured`` pictures, and labelled ones that were
+    ``unmeasured``; ``false``: detections that found no box.
     """
     counts = {name: {"boxes": 0, "found": 0} for name in WIDTH_CLASSES}
     measured, false, judged, left = 0, 0, list[tuple[float, bool]](), dict(labels)
@@ -114,7 +116,7 @@ def scored(pictures: Sequence[dict[str, Any]], labels: dict[Path, list[Box]]) ->
     ap50 = average_precision(judged, count)
     per_picture = false / measured if measured else None
     return {
-        "boxes": count, "by_width": counts, "ap50": None if ap50 is None else round(ap50, 4),
+        "unmeasured": len(left), "boxes": count, "by_width": counts, "ap50": None if ap50 is None else round(ap50, 4),
         "measured": measured, "false": false, "false_per_picture": per_picture,
     }  # fmt: skip
 
@@ -189,6 +191,9 @@ def main() -> None:
     found = _told(args.found, lambda: scored(detected, labels), "what `flockd detect --json` printed")
     if not found["measured"]:
         raise SystemExit(f"{args.found}: has none of the pictures of {args.labels}; detect in the folder of the labels")
+    if found["unmeasured"]:
+        told = f"{found['unmeasured']} of {len(labels)} pictures of {args.labels} are not in {args.found}"
+        print(f"{told}; detect in all of them, and check their file names", file=sys.stderr)
     print(json.dumps(found, indent=1))
 
 

@@ -16,7 +16,9 @@ LEAST_BAUD = 57_600
 
 
 def _baud(address: str) -> str:
-    """Raises ValueError if no serial port has this baud rate, or if it is too slow."""
+    """Raises ValueError if no serial port has this baud rate, or if it is too slow; or for an address of all."""
+    if re.match(r"(udp|tcp)out://0\.0\.0\.0:", address):
+        raise ValueError(f"{address} names no computer to send to; write the autopilot's address, or `udpin://`")
     baud = address.rpartition(":")[2]
     rates = [name[1:] for name in dir(termios) if re.fullmatch(r"B[1-9]\d*", name)]
     enough = sorted((rate for rate in rates if int(rate) >= LEAST_BAUD), key=int)

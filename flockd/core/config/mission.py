@@ -130,6 +130,11 @@ def mission_faults(mission: MissionParameters, gate: GateParameters, law_speed_m
     for key, height_m in heights.items():
         if height_m is not None and (fault := fault_of_height(gate, height_m + mission.height_offset_m)):
             faults[key] = fault
+    if mission.kind == "waypoints" and mission.reached_m >= (across_m := _fence_across_m(gate)):
+        told = (
+            f"{mission.reached_m:g} m is not below the {across_m:g} m across the fence: all waypoints count as reached"
+        )
+        faults["reached_m",] = f"{told}; write a smaller one"
     first_deg: tuple[float, float] | None = None
     for i, waypoint in enumerate(mission.waypoints):
         if waypoint.north_m is None or waypoint.east_m is None:  # in degrees: where it is shows before home is known
@@ -151,9 +156,13 @@ def _faults_of_speeds(mission: MissionParameters, limit_m_s: float) -> Faults:
     speeds |= {("waypoints", i, "speed_m_s"): waypoint.speed_m_s for i, waypoint in enumerate(mission.waypoints)}
     if mission.velocity_m_s is not None:
         speeds["velocity_m_s",] = math.hypot(*mission.velocity_m_s)
-    return {
+    faults = {
         key: fault for key, speed in speeds.items() if speed is not None and (fault := fault_of_speed(limit_m_s, speed))
     }
+    if mission.kind in {"circle_then_tangent", "waypoints", "operator"}:
+        still = (key for key, speed in speeds.items() if speed == 0.0)
+        faults |= dict.fromkeys(still, f"0 m/s leads nowhere with kind `{mission.kind}`; write more, or kind `hover`")
+    return faults
 
 
 def fault_of_speed(limit_m_s: float, speed_m_s: float) -> str | None:

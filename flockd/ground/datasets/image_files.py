@@ -35,13 +35,15 @@ UNREAD_SUFFIXES = _suffixes(
     "yuv nv12 3gp 3g2 mts m2ts ts wmv flv insv ogv mjpeg mjpg h264 264 h265 265 hevc y4m"
 )
 """Kinds of pictures and videos that are not read; those of a folder are reported."""
-_WITH_PAGES = re.compile(rb"II\*\0|MM\0\*|GIF8|RIFF....WEBP|....ftypavi", re.DOTALL)
+_WITH_PAGES = re.compile(rb"II[*+]\0|MM\0[*+]|GIF8|RIFF....WEBP|....ftypavi", re.DOTALL)
 """First bytes of files that may hold several pages, whatever their name."""
 _PAGES = "has {} pages, of which one would be read; save each as an image"
 _PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND"
 _JPEG = b"\xff\xd8"
 MAX_FILE_BYTES = 1 << 29
 """Largest file: an uncompressed image of the largest permitted size with 16 bits, and some reserve."""
+_XMP = 1 << 17
+"""Bytes in which a JPEG tells its projection (GPano, as of phones and 360 degree cameras)."""
 _AVIF_HEAD = 4096
 """Bytes in which the properties of an AVIF's image are."""
 _CHUNK_FRAME = 12
@@ -71,8 +73,10 @@ def unread(files: Iterable[Path]) -> str | None:
     return ", and ".join(told) or None
 
 
-_USED_PERCENT = 99.9
-"""Of the values of an image with more than 8 bits; single hot pixels do not count."""
+_FAR_ABOVE = 8
+"""Least value, in ranges of the values, that is no sensor's black level or haze."""
+_USED_PERCENT = (0.1, 99.9)
+"""Of the values of an image with more than 8 bits; single hot and dead pixels do not count."""
 
 
 def in_order(files: Iterable[Path]) -> list[Path]:
@@ -87,7 +91,8 @@ def in_order(files: Iterable[Path]) -> list[Path]:
 
 def read_image(path: Path, size: tuple[int, int] | None = None) -> UInt8Array:
     """(h, w, 3) RGB, turned as the file's orientation says; grey images have three equal channels. Of images with
-    10, 12 or 16 bits the range that they use becomes 8 bits. Raises DatasetError, also for another ``size``.
+    10, 12 or 16 bits the range that they use becomes 8 bits; it begins at 0, unless all values are far above, as of
+    thermal cameras. Raises DatasetError, also for another ``size``.
     """
     # Not IMREAD_COLOR_RGB: OpenCV 5.0.0 garbles TIFF of 16 bits with it.
     decoded = _decoded(path, cv2.IMREAD_COLOR_BGR | cv2.IMREAD_ANYDEPTH)
@@ -95,8 +100,10 @@ def read_image(path: Path, size: tuple[int, int] | None = None) -> UInt8Array:
         raise DatasetError(f"{path}: has pixels of {decoded.dtype}; save it with 8 or 16 bits a channel")
     image = cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB)
     if image.dtype == np.uint16:
-        used_bits = int(np.percentile(image, _USED_PERCENT)).bit_length()
-        image = np.minimum(np.right_shift(np.asarray(image, np.uint16), max(used_bits - 8, 0)), 255)
+        least, most = (int(value) for value in np.percentile(image, _USED_PERCENT))
+        if least > _FAR_ABOVE * (most - least):
+            image, most = np.maximum(image, least) - np.uint16(least), most - least
+        image = np.minimum(np.right_shift(np.asarray(image, np.uint16), max(most.bit_length() - 8, 0)), 255)
     if size is not None:
         _check_size(path, image.shape[1::-1], size)
     return np.asarray(image, np.uint8)
@@ -125,7 +132,7 @@ def _decoded(path: Path, flags: int) -> cv2.typing.MatLike:
         else:
             data = path.read_bytes()
             data = data[: jpeg_end(data)]  # what cameras and phones write behind it is not looked at
-            fault = _fault(data) or _pages_fault(path, data)
+            fault = _fault(data) or _pages_fault(path, data) or _hole(data)
             if fault is None:
                 with _stderr_of_libraries() as said:
                     image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
@@ -151,7 +158,7 @@ _DAMAGED = "is damaged, or a kind of its format that is not read; restore it, or
 _OTHERS = {
     rb"GIF8|P[1-37]\s|Pf\s|\0\0\0\x0c(jP|JXL)|\xff\n|\xffO\xffQ|....ftyp(hei|hev|mif|msf|crx)": _CONVERT,
     rb"v/1\x01|#\?RADIANCE|8BPS|\0\0\x01\0": _CONVERT,
-    rb"\xff\xd8|II\*|MM\0|RIFF....WEBP|....ftypavi": _DAMAGED,
+    rb"\xff\xd8|II[*+]|MM\0|RIFF....WEBP|....ftypavi": _DAMAGED,
     rb"....ftyp|\x1aE\xdf\xa3|RIFF....AVI ": "is a video by its contents; give its name that ending",
     rb"\x1f\x8b|PK\x03\x04|\x28\xb5\x2f\xfd": "is packed; unpack it",
     rb"%PDF|<svg|<\?xml|<!DOCTYPE|<html": "is a document; save its picture as PNG",
@@ -173,7 +180,24 @@ def _fault(data: bytes) -> str | None:
     return None
 
 
+_SECTOR = 512
+_PACKED = re.compile(rb"RIFF....WEBP|....ftypavi", re.DOTALL)
+_PLAIN = re.compile(rb"BM|P[4-6]\s|II[*+]\0|MM\0[*+]")
+"""First bytes of formats with compressed data, and of others, whose decoders take zeros for data."""
+
+
+def _hole(data: bytes) -> str | None:
+    """Where a disk has lost data: compressed ones hold no long runs of zeros, others may, but not of whole sectors."""
+    packed = _PACKED.match(data) is not None
+    for run in re.finditer(rb"\0{512,}", data) if packed or _PLAIN.match(data) else ():
+        if packed or (run.start() % _SECTOR == 0 and (run.end() % _SECTOR == 0 or run.end() == len(data))):
+            return f"holds {run.end() - run.start()} bytes of zeros in place of data, from byte {run.start()} on"
+    return None
+
+
 def _pages_fault(path: Path, data: bytes) -> str | None:
+    if b"GPano:ProjectionType" in data[:_XMP]:
+        return "is a panorama, as no lens gives it; cut a part out with straight lines"
     pages = cv2.imcount(str(path)) if _WITH_PAGES.match(data) else 1
     if pages <= 1 and re.search(rb"\0\0\0\x09(irot[\1-\3]|imir)", data[:_AVIF_HEAD]) and data[4:8] == b"ftyp":
         return "is turned or mirrored by its header, which is not read; save it as JPEG"

@@ -381,6 +381,17 @@ def test_steps_that_a_flight_would_wait_for_are_refused(
         ("autopilot.address", "serial:///dev/ttyAMA0:9600", "has the baud rate 9600, too slow for what the autopilot"),
         ("autopilot.address", "serial:///dev/ttyAMA0:38400", "too slow for what the autopilot has to send; write"),
         ("autopilot.address", "serial:///dev/serial/by-path/usb-0:1:1", "has the baud rate 1, which no port has"),
+        ("autopilot.address", "udpout://0.0.0.0:14540", "names no computer to send to; write the autopilot's address"),
+        (
+            "mission",
+            {"kind": "operator", "speed_m_s": 0},
+            "0 m/s leads nowhere with kind `operator`; write more, or kind",
+        ),
+        (
+            "mission",
+            {"kind": "waypoints", "waypoints": ({"north_m": 9, "east_m": 0},), "reached_m": 200},
+            "200 m is not below the 200 m across the fence: all waypoints count as reached; write a smaller",
+        ),
         ("telemetry.listen", ("tcp/127.0.0.1:7447", "tls/0.0.0.0:70000?x=1"), "has the port 70000"),
         ("telemetry.connect", ("udp/10.0.0.1:65536",), "has the port 65536"),
         ("telemetry.listen", ("tcp/0.0.0.0:0",), "has the port 0; write one from 1 to 65535"),
@@ -390,7 +401,9 @@ def test_steps_that_a_flight_would_wait_for_are_refused(
         ("telemetry.connect", ("tcp/[1:2:7447",), "has the host [1:2; write an IP address or a computer's name"),
     ],
 )
-def test_an_address_that_nothing_can_open_is_refused(key: str, value: Any, told: str, tmp_path: Path) -> None:
+def test_an_address_that_nothing_can_open_and_a_mission_that_leads_nowhere_are_refused(
+    key: str, value: Any, told: str, tmp_path: Path
+) -> None:
     (tmp_path / "drone.yaml").write_text(DRONE, encoding="utf-8")
     with pytest.raises(ConfigError) as caught:
         load_drone(tmp_path / "drone.yaml", {key: value})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import struct
 import tracemalloc
 import zlib
 from pathlib import Path
@@ -136,6 +137,15 @@ def test_the_bits_that_an_image_uses_become_eight(bits: int, suffix: str, tmp_pa
     assert np.array_equal(read_image(path), image[..., ::-1])
 
 
+def test_a_thermal_image_far_above_zero_has_its_own_range(tmp_path: Path) -> None:
+    """Hundredths of a kelvin, at 17 to 27 degrees: it was of one grey."""
+    image = cv2.cvtColor(_photograph(), cv2.COLOR_BGR2GRAY)
+    cv2.imwrite(str(tmp_path / "x.png"), 29_000 + 4 * image.astype(np.uint16))
+    shown = read_image(tmp_path / "x.png")[..., 0].astype(int)
+    assert np.ptp(shown) > 128
+    assert np.corrcoef(shown.ravel(), image.ravel())[0, 1] > 0.99
+
+
 def test_a_hot_pixel_does_not_make_an_image_of_ten_bits_black(tmp_path: Path) -> None:
     image, path = _photograph(), tmp_path / "x.png"
     ten_bits = image.astype(np.uint16) << 2
@@ -191,6 +201,40 @@ def test_pages_and_turns_count_by_the_contents_and_not_by_the_name(tmp_path: Pat
 def read_image_of(path: Path, data: bytes) -> UInt8Array:
     path.write_bytes(data)
     return read_image(path)
+
+
+def _big_tiff(pages: int) -> bytes:
+    """Of 32 x 32 grey pixels, by the specification of BigTIFF; all pages show the same."""
+    tags = {256: 32, 257: 32, 258: 8, 259: 1, 262: 1, 273: 16, 277: 1, 278: 32, 279: 1024}
+    page = struct.pack("<Q", len(tags)) + b"".join(struct.pack("<HHQQ", tag, 4, 1, n) for tag, n in tags.items())
+    follow = [1040 + (k + 1) * (len(page) + 8) for k in range(pages - 1)] + [0]
+    data = struct.pack("<2sHHHQ", b"II", 43, 8, 0, 1040) + bytes(range(256)) * 4
+    return data + b"".join(page + struct.pack("<Q", at) for at in follow)
+
+
+def test_a_big_tiff_has_pages_too(tmp_path: Path) -> None:
+    assert read_image_of(tmp_path / "x.tif", _big_tiff(1)).shape == (32, 32, 3)
+    with pytest.raises(DatasetError, match="has 2 pages, of which one would be read"):
+        read_image_of(tmp_path / "x.tif", _big_tiff(2))
+
+
+@pytest.mark.parametrize(("suffix", "begin"), [(".webp", 700), (".bmp", 1024), (".ppm", 1024), (".tif", 1024)])
+def test_zeros_of_a_disk_in_place_of_an_images_data_are_known(suffix: str, begin: int, tmp_path: Path) -> None:
+    """Of compressed data everywhere, of others by their sectors: black pixels are zeros too."""
+    data = bytes(cv2.imencode(suffix, np.maximum(_photograph(), 1))[1])
+    path = tmp_path / f"x{suffix}"
+    assert read_image_of(path, data).shape == (120, 160, 3)
+    with pytest.raises(
+        DatasetError, match=f"holds 1024 bytes of zeros in place of data, from byte {begin} on; restore it"
+    ):
+        read_image_of(path, data[:begin] + bytes(1024) + data[begin + 1024 :])
+
+
+def test_a_panorama_is_no_picture_of_a_lens(tmp_path: Path) -> None:
+    xmp = b"http://ns.adobe.com/xap/1.0/\0<x GPano:ProjectionType='equirectangular'/>"
+    data = _written(".jpg")
+    with pytest.raises(DatasetError, match="is a panorama, as no lens gives it; cut a part out"):
+        read_image_of(tmp_path / "x.jpg", data[:2] + b"\xff\xe1" + (len(xmp) + 2).to_bytes(2) + xmp + data[2:])
 
 
 def test_what_an_image_holds_that_is_not_read_is_said(tmp_path: Path) -> None:

@@ -417,8 +417,9 @@ def test_pictures_without_colour_are_told(capsys: Capture, told: Told, tmp_path:
     tinted = grey + np.array([0, 0, 2], np.uint8)
     for name, picture in (("grey.jpg", grey), ("tinted.png", tinted), ("colour.png", image)):
         cv2.imwrite(str(tmp_path / name), picture)
+    cv2.imwrite(str(tmp_path / "covered.png"), np.zeros_like(image))
     assert main(["detect", str(tmp_path), *FOV, "--json"]) == 0
     captured = capsys.readouterr()
     assert json.loads(captured.out)["without_colour"] == 1
-    assert "1 of 3 without colour" in captured.err
+    assert "1 of 4 of one colour all over; uncover the lens, or give other pictures\n1 of 4 without" in captured.err
     assert "without colour" not in told(0, "detect", NEAR, *FOV)

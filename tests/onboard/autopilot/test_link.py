@@ -71,10 +71,10 @@ async def test_telemetry_is_what_the_vehicle_does(port: int, address: str) -> No
         assert status.position_ned is not None
         np.testing.assert_allclose(state.velocity_ned, truth.velocity, atol=1e-6)
         assert state.height_m == pytest.approx(7.5, abs=1e-5)
-        assert 0.0 <= status.time_s - state.time_s < 0.5
+        assert state.time_s <= status.time_s
         np.testing.assert_allclose(status.position_ned, truth.position, atol=1e-6)
         assert (status.flight_mode, status.armed, status.failsafe, status.in_air) == ("hold", True, False, True)
-        assert status.heartbeat_age_s < 2 * HEARTBEAT_S
+        await until(lambda: link.status().heartbeat_age_s < 2 * HEARTBEAT_S)
         assert (status.estimate_ok, status.gps_ok) == (True, True)
         assert status.battery_share == pytest.approx(0.42)
 
@@ -92,11 +92,12 @@ async def test_what_another_component_of_its_system_sends_is_not_the_autopilots(
     async with attended(address) as link:
         fake_autopilot.silent = True
         gimbal = mavlink.MAVLink(Wire(port), srcSystem=1, srcComponent=mavlink.MAV_COMP_ID_GIMBAL)
-        for _ in range(4):
-            await asyncio.sleep(HEARTBEAT_S)
+
+        def ages() -> bool:
             gimbal.heartbeat_send(mavlink.MAV_TYPE_GIMBAL, mavlink.MAV_AUTOPILOT_INVALID, 0, 6 << 16, 4)
-        await asyncio.sleep(0.5 * HEARTBEAT_S)
-        assert link.status().heartbeat_age_s > 3 * HEARTBEAT_S
+            return link.status().heartbeat_age_s > 3 * HEARTBEAT_S
+
+        await until(ages)
         assert link.status().flight_mode == "hold"
 
 

@@ -73,5 +73,5 @@ def test_an_error_that_nobody_expects_comes_when_what_runs_beside_it_has_ended()
 
 def test_each_image_has_the_deadline_for_itself() -> None:
     networks = Pictures()
-    networks.instead = dict.fromkeys(range(6), lambda: time.sleep(0.3))
-    assert len(WatchedNetworks(networks, 0.9, 1).flows([pair(k) for k in range(6)])) == 6
+    networks.instead = dict.fromkeys(range(6), lambda: time.sleep(0.25))
+    assert len(WatchedNetworks(networks, 1.4, 1).flows([pair(k) for k in range(6)])) == 6

@@ -62,6 +62,7 @@ def test_pictures_with_and_without_drones_and_one_without_labels(tmp_path: Path)
     found = scored(pictures, read_labels(tmp_path / "labels.json"))
     assert found["by_width"].pop("12-30") == {"boxes": 3, "found": 2}
     assert set(map(str, found.pop("by_width").values())) == {"{'boxes': 0, 'found': 0}"}
+    assert found.pop("unmeasured") == 0
     assert found == {"boxes": 3, "ap50": round(1 / 3, 4), "measured": 4, "false": 2, "false_per_picture": 0.5}
 
 
@@ -72,6 +73,19 @@ ONE_BOX = '{"image_id": 1, "category_id": 1, "bbox": [1, 1, 9, 9]}'
 A_BOX = NO_PICTURES.replace('"images": []', '"images": [{"id": 1, "file_name": "a.png"}]').replace(
     '"annotations": []', f'"annotations": [{ONE_BOX}]'
 )
+
+
+def test_labelled_pictures_in_which_nothing_was_detected_are_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As with names of another system, C:\\a.png: the figures were of the others alone."""
+    labels = A_BOX.replace('"images": [', '"images": [{"id": 2, "file_name": "b.png"}, ')
+    (tmp_path / "labels.json").write_text(labels)
+    found = {"pictures": [{"file": str(tmp_path / "a.png"), "detections": []}]}
+    (tmp_path / "found.json").write_text(json.dumps(found))
+    monkeypatch.setattr("sys.argv", ["labelled", *(str(tmp_path / name) for name in ("found.json", "labels.json"))])
+    main()
+    assert f"1 of 2 pictures of {tmp_path}/labels.json are not in {tmp_path}/found.json; det" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
