@@ -101,6 +101,14 @@ def test_what_is_not_enough_is_said_in_one_sentence(folder: Path, told: Told, tm
         1, *command, "--squares", "7x6"
     )
     assert "1 usable views" in told(1, *command, "--squares", "7x6", "--legacy")
+    board = np.pad(BoardSpec(7, 5, 0.036).image(60), 60, constant_values=255)
+    for image, shown, squares in (
+        (board, "the board of 7x5 squares", "5x7"),
+        (board[:, ::-1], "the board mirrored; let the camera not mirror its images", "7x5"),
+        (255 - board, "the board with black and white exchanged; print it black on white", "7x5"),
+    ):
+        write(folder / "wall.png", np.stack([image] * 3, axis=2))
+        assert f"the last shows {shown}" in told(1, *command, "--squares", squares)
     assert "no SOURCE was given" in told(2, "calibrate", "camera", "--out", out)
     assert "needs 70 markers" in told(2, *command, "--squares", "10x14")
     assert "squares of 0.036 mm are not printed; take 1 to 1000 mm" in told(2, *command, "--square-mm", "0.036")

@@ -110,11 +110,16 @@ class BoardFinder:
         """What the last image without the board shows, for people."""
         if self._without is None:
             return "boards at an angle from which all their corners are in one line"
-        other = BoardFinder(replace(self.spec, legacy=not self.spec.legacy))
-        if other.find(self._without) is not None:
-            return (
-                f"the board as OpenCV {'before' if other.spec.legacy else 'from'} 4.6 makes it, for which --legacy is"
-            )
+        spec, grey = self.spec, self._without
+        made, swapped = "from" if spec.legacy else "before", f"{spec.rows}x{spec.columns}"
+        for told, other, image in (
+            (f"as OpenCV {made} 4.6 makes it, for which --legacy is", replace(spec, legacy=not spec.legacy), grey),
+            (f"of {swapped} squares", replace(spec, columns=spec.rows, rows=spec.columns), grey),
+            ("mirrored; let the camera not mirror its images", spec, np.ascontiguousarray(grey[:, ::-1])),
+            ("with black and white exchanged; print it black on white", spec, 255 - grey),
+        ):
+            if BoardFinder(other).find(image) is not None:
+                return f"the board {told}"
         counts = {}
         for name in sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_")):
             dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))

@@ -14,7 +14,7 @@ import zenoh
 from pydantic import TypeAdapter, ValidationError
 
 from flockd.core.config.base import Endpoint
-from flockd.core.errors import ExitCode, FlockdError, UnavailableError
+from flockd.core.errors import ExitCode, FlockdError, UnavailableError, UsageError
 
 MOST_REASON = 200
 """Largest number of characters quoted from zenoh in an error."""
@@ -49,14 +49,14 @@ def open_session(
     in errors; ``settings``: a file of zenoh's settings to start from, for TLS and access control; unused parts are
     logged. Longer messages and more peers than the limits are refused; None: as in zenoh or the settings.
     ``awaits_addresses``: an address that no interface has yet, such as Wi-Fi's at the start, is listened on once one
-    has it. Raises UnavailableError.
+    has it. Raises UsageError for what is no endpoint, and UnavailableError.
     """
     for endpoint in (*listen, *connect):
         try:
             _ENDPOINT.validate_python(endpoint)
         except ValidationError:
             told = "is not a zenoh endpoint; write protocol, address and port (1 to 65535), as in `tcp/10.0.0.11:7447`"
-            raise UnavailableError(f"{purpose}: {endpoint} {told}") from None
+            raise UsageError(f"{purpose}: {endpoint} {told}") from None
     wanted = {
         "mode": "peer",
         "scouting/multicast/enabled": False,

@@ -274,7 +274,9 @@ class Watched:
     async def _query(self, what: str, payload: bytes = b"") -> bytes:
         key = f"flockd/v1/test/tiny/{what}"
         for _ in range(100):  # until the two have found each other; zenoh tries again ever less often
-            replies = await asyncio.to_thread(lambda: list(self.session.get(key, payload=payload, timeout=3.0)))
+            replies = await asyncio.to_thread(
+                lambda: list(self.session.get(key, payload=payload, timeout=SECONDS_TO_FAIL))
+            )
             if replies:
                 break
             await asyncio.sleep(0.1)

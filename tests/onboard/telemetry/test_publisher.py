@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import zenoh
 
-from flockd.core.errors import UnavailableError
+from flockd.core.errors import UnavailableError, UsageError
 from flockd.core.messages import (
     SECTORS,
     MissionStatus,
@@ -154,7 +154,7 @@ def test_a_taken_port_is_reported_in_one_sentence() -> None:
 
 @pytest.mark.parametrize("endpoint", ["drone1:7447", "tcp/10.0.0.11", "tcp/127.0.0.1:70000", "http://drone1:7447"])
 def test_what_is_no_endpoint_is_refused_with_what_to_write(endpoint: str) -> None:
-    with pytest.raises(UnavailableError, match=f"a page: {endpoint} is not a zenoh endpoint; write protocol, address"):
+    with pytest.raises(UsageError, match=f"a page: {endpoint} is not a zenoh endpoint; write protocol, address"):
         open_session("a page", [], [endpoint])
 
 
