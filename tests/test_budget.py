@@ -20,19 +20,19 @@ from flockd.onboard.recording.reader import Recording
 
 ROOT = Path(__file__).parents[1]
 LINES = {
-    "flockd/core": 3_360,
+    "flockd/core": 3_370,
     "flockd/flight": 9_490,
     "flockd/onboard": 9_250,
     "flockd/fleet": 2_710,
-    "flockd/ground": 5_340,
-    "flockd/review": 3_590,
+    "flockd/ground": 5_390,
+    "flockd/review": 3_630,
     "flockd/sim": 8_930,
-    "flockd/campaign": 1_480,
-    "flockd/cli": 3_830,
-    "tests": 39_540,
+    "flockd/campaign": 1_490,
+    "flockd/cli": 3_840,
+    "tests": 39_730,
     "tools/checks": 1_710,
     "tools/docs": 1_010,
-    "tools/measure": 1_520,
+    "tools/measure": 1_530,
     "tools/release": 590,
     "tools/training": 4_330,
 }

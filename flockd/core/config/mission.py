@@ -130,11 +130,9 @@ def mission_faults(mission: MissionParameters, gate: GateParameters, law_speed_m
     for key, height_m in heights.items():
         if height_m is not None and (fault := fault_of_height(gate, height_m + mission.height_offset_m)):
             faults[key] = fault
-    if mission.kind == "waypoints" and mission.reached_m >= (across_m := _fence_across_m(gate)):
-        told = (
-            f"{mission.reached_m:g} m is not below the {across_m:g} m across the fence: all waypoints count as reached"
-        )
-        faults["reached_m",] = f"{told}; write a smaller one"
+    if mission.kind == "waypoints" and mission.reached_m >= (across_m := _fence_across_m(gate)) / 2:
+        told = f"{mission.reached_m:g} m is not below half of the {across_m:g} m across the fence"
+        faults["reached_m",] = f"{told}: waypoints count as reached from home; write a smaller one"
     first_deg: tuple[float, float] | None = None
     for i, waypoint in enumerate(mission.waypoints):
         if waypoint.north_m is None or waypoint.east_m is None:  # in degrees: where it is shows before home is known

@@ -389,8 +389,8 @@ def test_steps_that_a_flight_would_wait_for_are_refused(
         ),
         (
             "mission",
-            {"kind": "waypoints", "waypoints": ({"north_m": 9, "east_m": 0},), "reached_m": 200},
-            "200 m is not below the 200 m across the fence: all waypoints count as reached; write a smaller",
+            {"kind": "waypoints", "waypoints": ({"north_m": 9, "east_m": 0},), "reached_m": 100},
+            "100 m is not below half of the 200 m across the fence: waypoints count as reached from home; write a",
         ),
         ("telemetry.listen", ("tcp/127.0.0.1:7447", "tls/0.0.0.0:70000?x=1"), "has the port 70000"),
         ("telemetry.connect", ("udp/10.0.0.1:65536",), "has the port 65536"),
