@@ -23,12 +23,13 @@ def _message(kind: str, covariance: float = 0.0, w: float = math.cos(math.pi / 4
     turn = SimpleNamespace(x=0.0, y=0.0, z=math.sin(math.pi / 4) if w else 0.0, w=w)
     header = SimpleNamespace(frame_id=frame)
     pose = SimpleNamespace(orientation=turn, position=_three(3.0, 4.0, 5.0), header=header)
+    pose.orientation_covariance = [covariance]
     if kind == IMU:
         return pose
     if kind == POSE:
         return SimpleNamespace(pose=pose, header=header)
     twist = SimpleNamespace(twist=SimpleNamespace(linear=_three(2.0, 1.0, 0.5)), covariance=[covariance])
-    return SimpleNamespace(pose=SimpleNamespace(pose=pose), twist=twist, header=header)
+    return SimpleNamespace(pose=SimpleNamespace(pose=pose, covariance=[0.0]), twist=twist, header=header)
 
 
 def test_an_odometry_is_the_whole_state() -> None:
@@ -51,6 +52,7 @@ def test_what_nobody_filled_in_is_not_taken() -> None:
     unknown = vehicle_state(ODOMETRY, _message(ODOMETRY, covariance=-1.0), 7.0)
     assert unknown is not None
     assert unknown.velocity_ned is None
+    assert vehicle_state(IMU, _message(IMU, covariance=-1.0), 7.0) is None
     assert vehicle_state(POSE, _message(POSE, w=0.0), 7.0) is None
     assert vehicle_state(POSE, _message(POSE, frame="odom_ned"), 7.0) is None, "PX4's axes, as MAVROS names them"
 
