@@ -291,7 +291,7 @@ class FlockPilot:
             sunk_m = observation.previous.vehicle.height_m - observation.vehicle.height_m
         neighbours = self._tracker.neighbours()
         size_m = self._size.see(observation.time_s, sunk_m, measured, neighbours)
-        if size_m is not None and velocity is not None:
+        if size_m is not None:
             self._tracker.resize(size_m, velocity)
             neighbours = self._tracker.neighbours()
         return self._size.cautious(neighbours)

@@ -160,15 +160,18 @@ def updated(mixture: Mixture, measured: Measurements, parameters: TrackingParame
     return Mixture(weights / weights.sum(axis=-1, keepdims=True), mean, covariance)
 
 
-def resized(mixture: Mixture, size_m: float, own_velocity: FloatArray) -> Mixture:
+def resized(mixture: Mixture, size_m: float, own_velocity: FloatArray | None) -> Mixture:
     """Rescales all neighbours to this size: at the same apparent size each is nearer or farther by the same factor.
 
-    The velocity relative to `own_velocity`, (3,) NED m/s, is scaled too.
+    The velocity relative to `own_velocity`, (3,) NED m/s, is scaled too; None: not known, and velocities stay.
     """
     scale, mean = np.ones(mixture.mean.shape), mixture.mean
     scale[..., :6] = (size_m / np.exp(mean[..., 6]))[..., None]
     offset = np.zeros(filter.SIZE)
-    offset[3:6] = own_velocity
+    if own_velocity is None:
+        scale[..., 3:6] = 1.0
+    else:
+        offset[3:6] = own_velocity
     mean = scale * (mean - offset) + offset
     mean[..., 6] = math.log(size_m)
     return Mixture(mixture.probability, mean, scale[..., None] * mixture.covariance * scale[..., None, :])

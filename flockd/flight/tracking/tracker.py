@@ -133,10 +133,10 @@ class Tracker:
         later = imm.predicted(self._motions[known], interval_s, displacement, 0.0, self.parameters, self._braking_m_s2)
         return tuple(Prediction(mean[:3], math.exp(mean[6])) for mean in later.together.mean[:, 0])
 
-    def resize(self, size_m: float, own_velocity: FloatArray) -> None:
+    def resize(self, size_m: float, own_velocity: FloatArray | None) -> None:
         """Rescales all neighbours to `size_m`, from tip to tip, and their ranges by the same factor.
 
-        `own_velocity` (3,) NED m/s.
+        `own_velocity` (3,) NED m/s; None: not known.
         """
         self._motions = imm.resized(self._motions, size_m, own_velocity)
 

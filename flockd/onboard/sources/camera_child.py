@@ -331,9 +331,9 @@ def body_of(info: Any) -> bytes:
 
 
 def numbers_of(info: Any) -> tuple[float, ...]:
-    """Width, height; fx, fy, cx, cy; five coefficients, NaN for more; whether they are of a fisheye."""
+    """Width, height; fx, fy, cx, cy; five coefficients, NaN for none or more; whether of a fisheye."""
     fx, _, cx, _, fy, cy, *_ = info.k
-    k = [float("nan")] * 5 if len(info.d) > 5 else [*info.d, *[0.0] * (5 - len(info.d))]
+    k = [float("nan")] * 5 if not 0 < len(info.d) <= 5 else [*info.d, *[0.0] * (5 - len(info.d))]
     return info.width, info.height, fx, fy, cx, cy, *k, info.distortion_model in {"equidistant", "fisheye"}
 
 

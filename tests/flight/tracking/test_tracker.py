@@ -482,3 +482,17 @@ def test_one_lie_of_the_own_motion_changes_no_track() -> None:
         numbers.add(tracker.update(step * STEP_S, seen, CRUISE))
     assert numbers == {(1, 2)}
     np.testing.assert_allclose([one.position for one in tracker.neighbours()], places, atol=0.2)
+
+
+@pytest.mark.parametrize(("own", "east_m_s"), [(CRUISE, 1.0), (None, 0.5)])
+def test_a_learned_size_scales_ranges_and_known_relative_velocities(own: Array | None, east_m_s: float) -> None:
+    """A track of 0.6 m at 4 m that flies 0.5 m/s to the east of the own way, and is 1.2 m large."""
+    follower = Follower()
+    for tick in range(20):
+        follower.step(AHEAD + 0.25 * tick * EAST, sigma_m=0.01)
+    (before,) = follower.all
+    follower.tracker.resize(1.2, own)
+    (after,) = follower.all
+    np.testing.assert_allclose(after.position, 2 * before.position, rtol=1e-2)
+    assert before.velocity[1] == pytest.approx(0.5, abs=0.05)
+    assert after.velocity[1] == pytest.approx(east_m_s, abs=0.1)

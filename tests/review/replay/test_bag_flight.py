@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -17,9 +18,12 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from flockd.cli import main
 from flockd.core.config import load_drone
+from flockd.core.config.rig import IntrinsicsConfig
 from flockd.core.messages import FloatArray, UInt8Array
 from flockd.onboard.recording import RecordingError
 from flockd.onboard.recording.reader import Recording
+from flockd.onboard.sources.camera_child import numbers_of
+from flockd.onboard.sources.ros_device import info_fault
 from flockd.review.replay.bag_flight import Bag, recording_of_bag
 from tests.onboard.recording.made_up import MadeUpPilot
 
@@ -261,6 +265,15 @@ def test_images_and_lenses_that_a_drone_would_refuse_are_refused(
 ) -> None:
     with Bag(bag(tmp_path / "bag", **given)) as theirs, pytest.raises(RecordingError, match=re.escape(sentence)):
         recording_of_bag(theirs, load_drone(config_file(tmp_path)), None, tmp_path / "flight.mcap")
+
+
+def test_a_camera_info_without_coefficients_contradicts_no_lens() -> None:
+    k = [50.0, 0.0, 31.5, 0.0, 50.0, 23.5, 0.0, 0.0, 1.0]
+    fisheye = IntrinsicsConfig(model="wide_angle", fx=50.0, fy=50.0, cx=32.0, cy=24.0, distortion=(0.02, 0.0, 0.0, 0.0))
+    for d, fault in ((), None), ((0.0,) * 5, "degrees by its D"):
+        found = numbers_of(SimpleNamespace(width=64, height=48, k=k, d=d, distortion_model="plumb_bob"))
+        told = info_fault(fisheye, (64, 48), "/front/image_raw", found)
+        assert told is None if fault is None else fault in str(told)
 
 
 def test_images_that_cannot_be_used_are_counted_and_without_any_there_is_no_flight(tmp_path: Path) -> None:
