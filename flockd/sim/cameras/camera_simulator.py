@@ -16,7 +16,7 @@ from flockd.flight.mission import Moment, Navigator
 from flockd.ground.calibration.camera_motion import scaled_focal
 from flockd.sim.cameras.imperfect_cameras import RigErrorsConfig
 from flockd.sim.cameras.lens_views import lens_view
-from flockd.sim.cameras.real_camera import NOISE_TILE, NoiseTile, Shot, real_cameras
+from flockd.sim.cameras.real_camera import NOISE_TILE, NoiseTile, Shot, place_in_tile, real_cameras
 from flockd.sim.cameras.shutter import CameraMotion
 from flockd.sim.renderer.airframe import DroneModel
 from flockd.sim.renderer.drone_models import FAMILIES, drone_model
@@ -134,6 +134,8 @@ class CameraSimulator:
             name: flock[name].position[drone] + flock[name].R_ned_body[drone] @ mounted.T_body_camera.translation
             for name, mounted in cameras.items()
         }
+        # Drawn in the cameras' order, so that the images do not depend on their threads.
+        noise = {name: self._noise.drawn(camera.camera.size) for name, camera in cameras.items()}
 
         def sensed_by(name: str) -> UInt8Array:
             def draw(matrix: FloatArray, size: tuple[int, int], R_lens_part: FloatArray) -> View:
@@ -143,20 +145,20 @@ class CameraSimulator:
                 )  # fmt: skip
 
             seen = lens_view(cameras[name].camera, draw)
-            if self._real is None or not self._real[drone, name].changes_views:
-                return seen.rgb
+            if self._real is None:
+                return noise[name](seen.rgb)
+            if not self._real[drone, name].changes_views:
+                return self._real[drone, name].compressed(noise[name](seen.rgb))
             motion = self._motion(drone, name, shots[name].shown_s, turns[name], trail)
             sun = self._world.light[0] @ turns[name]
-            return self._real[drone, name].image(seen, motion, sun)
+            sensed = noise[name](self._real[drone, name].image(seen, motion, sun))
+            return self._real[drone, name].compressed(sensed)
 
         drawn = self._map(sensed_by, cameras)
 
         def frame_set() -> FrameSet:
-            frames = {}  # side by side; noise is drawn in their order, so that the images do not depend on that
-            for name, sensed in zip(cameras, drawn, strict=True):
-                image = self._noise.add(sensed)
-                if self._real is not None:
-                    image = self._real[drone, name].compressed(image)
+            frames = {}
+            for name, image in zip(cameras, drawn, strict=True):
                 if shots[name].comes and name not in off:
                     frames[name] = Frame(name, image, shots[name].stamp_s, step)
             return FrameSet(time_s, frames)
@@ -202,16 +204,19 @@ class ImageNoise:
     """Normal noise of ``sigma`` grey levels, different in each image."""
 
     def __init__(self, sigma: float, seed: int) -> None:
-        self._rng = np.random.default_rng([seed, 2])
-        self._tile = NoiseTile(self._rng, sigma) if sigma > 0 else None
+        self._rng, self._tile = np.random.default_rng([seed, 2]), None
+        if sigma > 0:
+            levels = np.rint(sigma * NoiseTile(self._rng).normal).clip(-255, 255)
+            self._tile = np.maximum(levels, 0).astype(np.uint8), np.maximum(-levels, 0).astype(np.uint8)
 
-    def add(self, image: UInt8Array) -> UInt8Array:
-        """The image (h, w, 3) with noise."""
-        if self._tile is None:
-            return image
-        within = max(NOISE_TILE[0] - image.shape[0], 1), max(NOISE_TILE[1] - image.shape[1], 1)
-        noise = self._tile.crop(image.shape[:2], self._rng, within)
-        return np.asarray(cv2.add(image, noise, dtype=cv2.CV_8U), dtype=np.uint8)
+    def drawn(self, size: tuple[int, int]) -> Callable[[UInt8Array], UInt8Array]:
+        """Adds the next noise to an image (h, w, 3) of a size (width, height)."""
+        if (tile := self._tile) is None:
+            return lambda image: image
+        within = max(NOISE_TILE[0] - size[1], 1), max(NOISE_TILE[1] - size[0], 1)
+        place = place_in_tile(size[::-1], self._rng, within)
+        brighter, darker = (one[place] for one in tile)
+        return lambda image: np.asarray(cv2.subtract(noisy := cv2.add(image, brighter), darker, dst=noisy), np.uint8)
 
 
 def planned_path(scenario: ScenarioConfig) -> FloatArray:

@@ -9,7 +9,6 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from flockd.core.messages import BoolArray, Float32Array, FloatArray, UInt8Array
 from flockd.flight.geometry import Camera
@@ -84,21 +83,20 @@ NOISE_TILE = (1031, 1033)
 class NoiseTile:
     """A tile of standard normal noise, of which images take crops."""
 
-    def __init__(self, rng: np.random.Generator, levels: float | None = None) -> None:
-        """``levels``: standard deviation in grey levels, and noise is rounded to them; None: 1, not rounded."""
-        self._tile: NDArray[Any] = rng.standard_normal((*NOISE_TILE, 3), dtype=np.float32)
-        if levels is not None:
-            self._tile = np.rint(levels * self._tile).clip(-255, 255).astype(np.int16)
+    def __init__(self, rng: np.random.Generator) -> None:
+        self.normal: Float32Array = rng.standard_normal((*NOISE_TILE, 3), dtype=np.float32)
 
-    def crop(
-        self, size: tuple[int, ...], rng: np.random.Generator, within: tuple[int, int] = NOISE_TILE
-    ) -> NDArray[Any]:
-        """(height, width, 3) of `size` from a place drawn `within` the first rows and columns, on past its borders."""
-        (top, left), (height, width) = (int(rng.integers(begins)) for begins in within), size
-        if top + height <= NOISE_TILE[0] and left + width <= NOISE_TILE[1]:
-            return self._tile[top : top + height, left : left + width]
-        rows = self._tile.take(np.arange(top, top + height), axis=0, mode="wrap")
-        return rows.take(np.arange(left, left + width), axis=1, mode="wrap")
+    def crop(self, size: tuple[int, ...], rng: np.random.Generator) -> Float32Array:
+        """(height, width, 3) of `size` at a drawn place."""
+        return np.asarray(self.normal[place_in_tile(size, rng)], np.float32)
+
+
+def place_in_tile(size: tuple[int, ...], rng: np.random.Generator, within: tuple[int, int] = NOISE_TILE) -> Any:
+    """Index of (height, width) of `size`, from a place drawn `within` the first rows and columns, on past borders."""
+    (top, left), (height, width) = (int(rng.integers(begins)) for begins in within), size
+    if top + height <= NOISE_TILE[0] and left + width <= NOISE_TILE[1]:
+        return np.s_[top : top + height, left : left + width]
+    return np.ix_(np.arange(top, top + height) % NOISE_TILE[0], np.arange(left, left + width) % NOISE_TILE[1])
 
 
 def noisy(light: Float32Array, normal: Float32Array, config: SensorNoiseConfig) -> Float32Array:
