@@ -26,10 +26,10 @@ LINES = {
     "flockd/fleet": 2_710,
     "flockd/ground": 5_390,
     "flockd/review": 3_630,
-    "flockd/sim": 8_930,
+    "flockd/sim": 9_080,
     "flockd/campaign": 1_490,
     "flockd/cli": 3_840,
-    "tests": 39_760,
+    "tests": 39_800,
     "tools/checks": 1_710,
     "tools/docs": 1_010,
     "tools/measure": 1_530,
@@ -37,7 +37,7 @@ LINES = {
     "tools/training": 4_330,
 }
 """Lines of Python below a folder."""
-FILES = {"flockd": 314}
+FILES = {"flockd": 315}
 NUMBERS_OF_FLIGHT = 199
 """In constants of the modules of `flockd/flight`."""
 SLACK = 0.02

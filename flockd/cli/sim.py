@@ -47,7 +47,7 @@ costs, with five drones on a processor without 8-bit instructions:
   time       12 s of processor time a simulated second, so 11 minutes on two free cores for the whole flight, and 10 s
              to begin; a flight of 10 s with three drones 66 s of processor time; with --perception truth a few
              seconds
-  memory     1.4 GB
+  memory     1.9 GB
   disk       31 MB for the report, its figures and the data behind them
   --record   another 4.5 MB a drone and simulated second: 2.5 GB for the whole flight
 Try `--duration 10 --drones 3` first. Ctrl-C ends a flight early, with a report of what was flown and exit code 130."""
@@ -56,8 +56,8 @@ OPTIONS = {"duration": "duration_s", "seed": "seed"}
 SITL = "px4_sitl.yaml"
 DEFAULT_SPEED_FACTOR = 0.25
 """Two cores then keep up with five drones."""
-DRONES_A_CORE = 1.5
-"""By sight in about real time: a second of a drone takes 0.6 s of processor time (AMD EPYC), pictures included."""
+DRONES_A_CORE = 1.7
+"""By sight in real time: a second of a drone takes 0.43 s of a processor (AMD EPYC), and a browser needs some too."""
 SPEED_FACTORS = (0.02, 10.0)
 """What a daemon's configuration allows."""
 
@@ -105,7 +105,7 @@ def add(commands: Commands) -> None:
     option(
         parser,
         "--drones N",
-        "size of the flock (default: the scenario's; --live by sight: three on two processors, five on four)",
+        "size of the flock (default: the scenario's; --live by sight: three on two processors, five on three)",
         _flock_size,
     )
     option(parser, "--duration S", "seconds to fly; the world is as large as the flight needs", positive_number)

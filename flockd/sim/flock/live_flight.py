@@ -10,7 +10,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 from flockd.fleet.simulation import SimulationMessage, checked_control
-from flockd.flight.perception import Networks
 from flockd.onboard.daemon.operator_orders import OrderChecks
 from flockd.onboard.telemetry.order_messages import parse_ask
 from flockd.onboard.telemetry.topics import AnswerMessage
@@ -19,6 +18,7 @@ from flockd.sim.flock.control_loop import ControlLoop
 from flockd.sim.flock.exact_states import vehicles_of
 from flockd.sim.flock.flight_film import FlightFilm
 from flockd.sim.flock.flock_telemetry import FlockTelemetry
+from flockd.sim.flock.pilots import Pilots
 from flockd.sim.flock.swarm import ExactStatePilots, VisionPilots, fly_commands
 from flockd.sim.scenario import ScenarioConfig
 from flockd.sim.vehicles.vehicles import UNDISTURBED, Disturbances
@@ -207,7 +207,7 @@ def fly_live(
     scenario: ScenarioConfig,
     shown: FlockTelemetry,
     controls: LiveControls,
-    eyes: tuple[CameraSimulator, Networks] | None,
+    eyes: tuple[CameraSimulator, Pilots] | None,
     *,
     gated: bool = True,
     film: FlightFilm | None = None,

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
@@ -12,13 +11,12 @@ import numpy as np
 
 from flockd import __version__
 from flockd.core.choices import SimulatedPerception
-from flockd.core.messages import FloatArray, FrameSet, MissionOrder, PilotOutput, VehicleState
-from flockd.flight.perception import Networks, load_networks
-from flockd.flight.pilot import FlockPilot, StepTrace
+from flockd.core.messages import FloatArray, PilotOutput
+from flockd.flight.perception import load_networks
 from flockd.onboard.recording import Recorder
 from flockd.onboard.recording.truth import TrueDrone, Truth
 from flockd.review.flight_log.builder import FlightLogBuilder
-from flockd.review.flight_log.key_frames import KeyFrame, capture, key_frame_steps
+from flockd.review.flight_log.key_frames import KeyFrame, key_frame_steps
 from flockd.review.flight_log.log import FlightLog
 from flockd.review.flight_log.metadata import FlightMetadata, MissionMetadata
 from flockd.sim.cameras.camera_simulator import CameraSimulator
@@ -33,6 +31,7 @@ from flockd.sim.flock.exact_states import (
     vehicles_of,
 )
 from flockd.sim.flock.flock_telemetry import FlockTelemetry
+from flockd.sim.flock.pilots import PilotProcesses, Pilots, PilotsHere, PilotStep
 from flockd.sim.renderer.airframe import DroneModel
 from flockd.sim.scenario import ScenarioConfig
 from flockd.sim.vehicles.vehicles import UNDISTURBED, Disturbances, SimulatedAutopilot, Vehicles
@@ -76,7 +75,7 @@ def fly(
             takes as long as it takes in the air.
         recorders: one a drone, or none.
         threads: for images; 0: these and pilots on the calling one; None: as many as there are processors. Pilots that
-            see step all at once.
+            see step all at once, in processes of their own.
         models: what each drone looks like; None: as the scenario says.
         pictured: keep key frames for the report.
         progress: called with (steps done, steps in all).
@@ -94,7 +93,7 @@ def fly(
     if perception == "learned":
         companion = fly_exact_states(scenario, gated=gated)[1:]
         eyes = eyes_of(scenario, threads, models)
-        pilots = VisionPilots(scenario, *eyes, shown, recorders, companion, threads)
+        pilots = VisionPilots(scenario, *eyes, shown, recorders, companion)
     first_s = time.perf_counter()
     try:
         for step, time_s in enumerate(times):
@@ -186,41 +185,34 @@ class ExactStatePilots:
 
 def eyes_of(
     scenario: ScenarioConfig, threads: int | None = None, models: Sequence[DroneModel] | None = None
-) -> tuple[CameraSimulator, Networks]:
-    """The cameras of all drones, and the networks that their pilots share. Raises ModelError."""
-    return CameraSimulator(scenario, threads, models), load_networks(scenario.drone.perception)
+) -> tuple[CameraSimulator, Pilots]:
+    """The cameras of all drones, and their pilots. Raises ModelError."""
+    cameras = CameraSimulator(scenario, threads, models)
+    if threads == 0:
+        return cameras, PilotsHere(load_networks(scenario.drone.perception))
+    return cameras, PilotProcesses(scenario.drone.perception, len(scenario.vehicles))
 
 
 class VisionPilots:
-    """One pilot a drone, each given only its own images and its own autopilot's readings.
-
-    They share their networks and nothing else, so that their order does not matter.
-    """
+    """One pilot a drone, each given only its own images and its own autopilot's readings."""
 
     def __init__(
         self,
         scenario: ScenarioConfig,
         cameras: CameraSimulator,
-        networks: Networks,
+        pilots: Pilots,
         shown: FlockTelemetry | None,
         recorders: Sequence[Recorder] = (),
         companion: tuple[FloatArray, FloatArray] | None = None,
-        threads: int | None = None,
     ) -> None:
-        """For a flight from the beginning. ``threads``: 0: pilots step on the calling one; else each on its own.
-
-        ``companion``: for what is recorded; None where nothing is.
-        """
+        """For a flight from the beginning. ``companion``: for what is recorded; None where nothing is."""
         self._scenario, self._yaw_rad, self._cameras = scenario, start_yaw(scenario), cameras
         self._shown, self._recorders, self._companion = shown, recorders, companion
         cameras.begin_again()
         self._hands = {i: navigator_of(scenario, i) for i, one in enumerate(scenario.vehicles) if one.by_hand}
         self._drones = tuple(i for i in range(len(scenario.vehicles)) if i not in self._hands)
-        self._pilots = {
-            i: FlockPilot(scenario.drone_of(i), networks, stopwatch=time.perf_counter) for i in self._drones
-        }
-        # All at once, as then they end together, and one waits for Python's lock while others compute.
-        self._map = map if threads == 0 else ThreadPoolExecutor(len(scenario.vehicles), thread_name_prefix="pilot").map
+        self._pilots = pilots
+        pilots.begin({i: scenario.drone_of(i) for i in self._drones})
         ground = cameras.ground_height
         self._autopilots = {
             i: SimulatedAutopilot(scenario.sensors, seed=scenario.seed, drone=i, ground=ground) for i in self._drones
@@ -238,46 +230,43 @@ class VisionPilots:
         pictured: bool,
         disturbed: Disturbances = UNDISTURBED,
     ) -> Commands:
-        """Commands for all drones, whose pilots step once all images are drawn. ``builder``: see `ExactStatePilots`."""
+        """Commands for all drones, each of whose pilots steps once its images are drawn. ``builder``: see
+        `ExactStatePilots`."""
         flying = [i for i in self._drones if i not in disturbed.removed]
         orders = {} if self._shown is None else self._shown.take_orders(flying)
         turn_rates = vehicles.trail.motion_at(time_s).turn
-        begin = time.perf_counter()
-        drawing = [self._cameras.capture(i, step, time_s, vehicles, vehicles.trail, disturbed) for i in flying]
-        sets = [frame_set() for frame_set in drawing]
-        render_ms = 1e3 * (time.perf_counter() - begin) / max(len(flying), 1)
-        states = [
-            self._autopilots[i].read(
-                time_s, vehicles.position[i], vehicles.velocity[i], vehicles.R_ned_body[i], turn_rates[i],
-                vehicles.errors[i] if vehicles.errors else None,
-            )
-            for i in flying
-        ]  # fmt: skip
-        with_pictures = [pictured and i in self._drones[:_KEY_FRAME_DRONES] for i in flying]
-        results = self._map(self._step, flying, sets, states, with_pictures, map(orders.get, flying))
+        drawing = {i: self._cameras.capture(i, step, time_s, vehicles, vehicles.trail, disturbed) for i in flying}
+        given, render_ms = dict[int, PilotStep](), dict[int, float]()
+
+        def drawn() -> Iterator[PilotStep]:
+            for i, frame_set in drawing.items():
+                begin = time.perf_counter()
+                frames = frame_set()
+                render_ms[i] = 1e3 * (time.perf_counter() - begin)
+                state = self._autopilots[i].read(
+                    time_s, vehicles.position[i], vehicles.velocity[i], vehicles.R_ned_body[i], turn_rates[i],
+                    vehicles.errors[i] if vehicles.errors else None,
+                )  # fmt: skip
+                with_pictures = pictured and i in self._drones[:_KEY_FRAME_DRONES]
+                given[i] = PilotStep(i, frames, state, with_pictures, orders.get(i))
+                yield given[i]
+
+        results = self._pilots.step(drawn())
         outputs, self.key_frames = dict[int, PilotOutput](), []
         truth = None if self._companion is None else self._truth(step, time_s, vehicles, self._companion)
-        for i, frames, state, (output, seen) in zip(flying, sets, states, results, strict=True):
+        for i, one in given.items():
+            output, seen = results[i]
             outputs[i] = output
             self.key_frames += seen
             if self._shown is not None:
-                self._shown.show(i, frames, state, output)
+                self._shown.show(i, one.frames, one.vehicle, output)
             if self._recorders and truth is not None:
                 recorder = self._recorders[self._drones.index(i)]
                 recorder.drain()  # simulated time stands still, so nothing need ever be dropped
-                recorder.step(frames, state, output, truth, orders.get(i))
+                recorder.step(one.frames, one.vehicle, output, truth, one.order)
             if builder is not None:
-                builder.add_output(step, i, output, {"render": render_ms, **output.stages_ms})
+                builder.add_output(step, i, output, {"render": render_ms[i], **output.stages_ms})
         return self._commands(time_s, vehicles, outputs)
-
-    def _step(
-        self, drone: int, frames: FrameSet, vehicle: VehicleState, pictured: bool, order: MissionOrder | None
-    ) -> tuple[PilotOutput, list[KeyFrame]]:
-        """One step of one pilot, with an operator's order; ``pictured``: with its key frames."""
-        trace = StepTrace() if pictured else None
-        output = self._pilots[drone].step(frames, vehicle, trace, order)
-        seen = [] if trace is None else capture(trace, output, drone)
-        return output, [frame.at_half_size() for frame in seen]
 
     def _commands(self, time_s: float, vehicles: Vehicles, outputs: Mapping[int, PilotOutput]) -> Commands:
         """Commands of the pilots, and of the people who fly drones by hand."""

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from flockd.core.messages import BoolArray, FloatArray, UInt8Array
 from flockd.flight.geometry import Rig, RigCamera, VirtualCrops, grid_pixels, virtual_crops
+from flockd.flight.geometry.cameras import Camera, PinholeCamera, WideAngleCamera
 
 from .synthetic_world import four_camera_rig
 
@@ -60,9 +63,12 @@ def test_they_sit_in_the_best_camera_and_face_level_along_the_direction() -> Non
     assert (border * forward).sum(1) == pytest.approx(np.cos([0.2, 0.3]))
 
 
-def test_every_pixel_takes_the_colour_of_its_own_ray_to_a_fraction_of_a_pixel() -> None:
+@pytest.mark.parametrize("lens", [PinholeCamera, WideAngleCamera])
+def test_every_pixel_takes_the_colour_of_its_own_ray_to_a_fraction_of_a_pixel(lens: type[Camera]) -> None:
     # Red and green of the image are its u and v, so the crop's colours say which pixel they were taken from.
     rig = four_camera_rig((120, 160), focal=55.5)
+    front = rig.cameras["front"]
+    rig = Rig({"front": replace(front, camera=lens(front.camera.matrix, front.camera.size))})
     pixels = grid_pixels((120, 160), 1).reshape(160, 120, 2)
     image = np.zeros((160, 120, 3), dtype=np.uint8)
     image[:, :, :2] = np.rint(1.5 * pixels)
