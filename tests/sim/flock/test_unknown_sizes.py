@@ -8,6 +8,7 @@ import pytest
 from flockd.core.messages import FloatArray
 from flockd.review.flight_log.log import FlightLog
 from flockd.sim.flock.swarm import fly
+from flockd.sim.renderer.drone_models import drone_model
 from tests import make
 
 
@@ -25,13 +26,13 @@ def range_errors(log: FlightLog, drone: int, since_s: float, until_s: float) -> 
 @pytest.mark.slow
 @pytest.mark.parametrize("family", [12, 13])
 def test_a_size_that_no_network_knows_is_found_in_twenty_seconds(family: int) -> None:
-    """By the first that weaves; its ranges are right from then on."""
+    """By the first that weaves, within twice the error that it states; its ranges are better from then on."""
     overrides = {"duration_s": 20.0, "world.drone_family": family, "drone.flocking.size": "learn"}
     log = fly(make.scenario(overrides, drones=3), pictured=False).log
     sizes = log.metadata.sizes
     drone = min(sizes, key=lambda one: sizes[one].since_s)
-    since_s = sizes[drone].since_s
+    since_s, true_m = sizes[drone].since_s, drone_model(family, 1).size_m
+    assert abs(np.log(sizes[drone].size_m / true_m)) < 2 * sizes[drone].sigma < 0.4
     before = range_errors(log, drone, 2.0, since_s - 0.1)
     after = range_errors(log, drone, since_s - 0.1, 24.0)
-    assert abs(np.median(after)) < 0.1
     assert np.median(np.abs(after)) < np.median(np.abs(before))
