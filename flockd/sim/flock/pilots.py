@@ -23,8 +23,13 @@ from flockd.flight.pilot import FlockPilot, StepTrace
 from flockd.review.flight_log.key_frames import KeyFrame, capture
 
 _NICER = 5
-_KEEP_MEMORY = {"MALLOC_TRIM_THRESHOLD_": str(2**28), "MALLOC_MMAP_THRESHOLD_": str(2**26)}
-"""Environment: the C library gives no memory of images back, only to get it again in the next step."""
+_ENVIRONMENT = {
+    "MALLOC_TRIM_THRESHOLD_": str(2**28),  # the C library gives no memory of images back, only to get it again
+    "MALLOC_MMAP_THRESHOLD_": str(2**26),
+    "OPENBLAS_NUM_THREADS": "1",  # see `flockd.program`
+    "MKL_NUM_THREADS": "1",
+}
+"""Of the processes, where it does not say otherwise."""
 Stepped = tuple[PilotOutput, list[KeyFrame]]
 
 
@@ -86,7 +91,7 @@ class PilotProcesses:
             for _ in range(min(drones, 1 + 2 * (os.cpu_count() or 1))):
                 here, there = Pipe()
                 command = [sys.executable, "-c", f"from {__name__} import serve; serve({there.fileno()})"]
-                environment = os.environ | _KEEP_MEMORY | {"PYTHONPATH": os.pathsep.join(sys.path)}
+                environment = _ENVIRONMENT | os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
                 self.processes.append(Popen(command, pass_fds=[there.fileno()], stdin=DEVNULL, env=environment))
                 there.close()
                 self._connections.append(here)
