@@ -44,11 +44,13 @@ async def test_no_camera_delivers_anything_new(fault: str, in_flight: InTheAir, 
             ship.cameras.spoil = frozen
         fault_s = clock()
         await ship.until_mode()
-        reacted(fault, clock() - fault_s)
+        held_s = clock()
+        reacted(fault, held_s - fault_s)
         assert not ship.fake_autopilot.failsafe, "it was asked for Hold, not left to its failsafe"
         # After three periods, or five repeats, however late a busy computer sends them.
         lost_s = fault_s + 0.6 if fault == "camera-unplugged" else repeated_s[6 * len(CAMERAS) - 1]
-        assert ship.standing_still(lost_s + STANDS_S)
+        # Hold, after which no setpoints are sent, may come first.
+        assert ship.standing_still(min(lost_s + STANDS_S, held_s - 0.1))
         why = "front silent, back silent" if fault == "camera-unplugged" else "front frozen, back frozen"
         await ship.until_event(f"hover: too few cameras deliver images: {why}")
         await ship.until_event("silent: ")
