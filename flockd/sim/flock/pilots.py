@@ -12,6 +12,7 @@ import time
 from collections.abc import Iterable, Mapping
 from multiprocessing.connection import Connection, Pipe
 from subprocess import DEVNULL, Popen
+from traceback import format_exc
 from typing import Any, NamedTuple, Protocol
 
 from flockd.core.config import DroneConfig
@@ -162,4 +163,5 @@ def serve(descriptor: int) -> None:
     except _GoneError:
         return
     except Exception as error:  # noqa: BLE001 - the other side raises it
+        error.add_note(format_exc())  # a traceback does not travel
         _send(connection, error)

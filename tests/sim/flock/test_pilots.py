@@ -15,9 +15,10 @@ from tests import make
 PERCEPTION = PerceptionConfig(flow="dis", detector="none", verification="none")
 
 
-def test_a_model_that_is_missing_is_named_as_without_processes() -> None:
-    with pytest.raises(ModelError, match=r"perception\.depth: there is no model 'nothing'"):
+def test_a_model_that_is_missing_is_named_as_without_processes_and_the_place_in_the_code_travels() -> None:
+    with pytest.raises(ModelError, match=r"perception\.depth: there is no model 'nothing'") as raised:
         PilotProcesses(PerceptionConfig(depth="nothing"), 2)
+    assert "in serve\n" in raised.value.__notes__[0]
 
 
 def test_ctrl_c_and_a_killed_process() -> None:
