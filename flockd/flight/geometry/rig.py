@@ -56,12 +56,21 @@ class Rig:
         """Mask (n,): body points (n, 3) around which any camera not in ``without`` images all within `radius_m`."""
         shown = np.zeros(len(points_body), dtype=np.bool_)
         for name in self.cameras.keys() - without:
-            camera = self.cameras[name]
-            sides = radius_m * camera.T_body_camera.rotation[:, :2].T  # its right and down
-            around = points_body[:, None] + (np.concatenate([sides, -sides]) if radius_m else np.zeros((1, 3)))
-            uv = camera.pixels_of_points(around.reshape(-1, 3)).reshape(len(points_body), -1, 2)
-            shown |= np.isfinite(uv).all(axis=(1, 2))
+            shown |= _imaged(self.cameras[name], points_body, radius_m).all(axis=1)
         return shown
+
+    def looking_at(self, points_body: FloatArray, radius_m: float) -> frozenset[str]:
+        """The cameras that image something within `radius_m` of any of these body points (n, 3)."""
+        return frozenset(name for name, one in self.cameras.items() if _imaged(one, points_body, radius_m).any())
+
+
+def _imaged(camera: RigCamera, points_body: FloatArray, radius_m: float) -> BoolArray:
+    """(n, k) which points `radius_m` to the camera's right, left, top and bottom of each point it images; without a
+    radius, the point."""
+    sides = radius_m * camera.T_body_camera.rotation[:, :2].T
+    around = points_body[:, None] + (np.concatenate([sides, -sides]) if radius_m else np.zeros((1, 3)))
+    uv = camera.pixels_of_points(around.reshape(-1, 3)).reshape(*around.shape[:2], 2)
+    return np.asarray(np.isfinite(uv).all(axis=2))
 
 
 def build_rig(config: RigConfig) -> Rig:

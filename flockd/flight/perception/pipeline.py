@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import replace
 
 from flockd.core.config.perception import PerceptionConfig
@@ -47,6 +47,7 @@ class Perception:
         trace: DetectionTrace | None = None,
         lap: Callable[[str], None] = lambda stage: None,
         learned_size: LearnedSize | None = None,
+        resting: Container[str] = (),
     ) -> Observation:
         """The observation of the newest frame set.
 
@@ -58,8 +59,9 @@ class Perception:
             trace: filled with the detector's intermediate results.
             lap: called at the end of each stage with its name, to time it.
             learned_size: of every drone, if the configuration gives none; None: the network estimates each one's.
+            resting: cameras that are not looked at in this step.
         """
-        usable, noisy, without_image = self._usable(frames, vehicle)
+        usable, noisy, without_image = self._usable(frames, vehicle, resting)
         scenes, depths, without_scene = self._scenes(usable, vehicle, ground)
         lap("scene")
         previous, without_pair = self._pair(frames)
@@ -77,12 +79,16 @@ class Perception:
         lap("detection")
         return self._last
 
-    def _usable(self, frames: FrameSet, vehicle: VehicleState) -> tuple[dict[str, Frame], tuple[str, ...], Reasons]:
+    def _usable(
+        self, frames: FrameSet, vehicle: VehicleState, resting: Container[str]
+    ) -> tuple[dict[str, Frame], tuple[str, ...], Reasons]:
         """Usable frames, cameras whose frames are noise, damaged or unclear, and the reasons."""
         usable, reasons = {}, []
         for name, camera in self._rig.cameras.items():
             width, height = camera.camera.size
             frame = frames.frames.get(name)
+            if name in resting:
+                continue
             if frame is None:
                 reasons.append(_of_camera(name, "no frame"))
             elif frame.image.shape != (height, width, 3):

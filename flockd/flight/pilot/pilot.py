@@ -45,6 +45,7 @@ from flockd.flight.pilot.ground import GroundFilter
 from flockd.flight.pilot.motions import background_pairs
 from flockd.flight.pilot.own_motion import OwnMotion
 from flockd.flight.pilot.size_learner import SizeLearner
+from flockd.flight.pilot.turns import Turns
 from flockd.flight.safety.surroundings import limits_towards
 from flockd.flight.tracking import Measurement, Prediction, Shown, Tracker
 
@@ -90,6 +91,7 @@ class FlockPilot:
         by_height = config.perception.scale == "height"
         self._ground = GroundFilter(config.perception.height, config.perception.range_finder) if by_height else None
         self._agreement = CameraAgreement(self._rig)
+        self._turns = Turns(self._rig, config.perception.longest_rest_s, config.safety.gate.min_separation_m)
         self._tracker = Tracker(config.tracking, config.safety.gate)
         self._size = SizeLearner(config, learned, flies=flies)
         self._law = FlockingLaw(config.flocking)
@@ -145,7 +147,10 @@ class FlockPilot:
         predictions = self._predictions(frames.time_s)
         ground, why_no_ground = (None, None) if self._ground is None else self._ground.update(vehicle)
         learned = self._size.learned
-        observation = self._perception.observe(frames, vehicle, ground, predictions, trace.detection, laps.end, learned)
+        resting = self._turns.resting(frames.time_s, frames.frames, lambda: self._near(vehicle.R_ned_body))
+        observation = self._perception.observe(
+            frames, vehicle, ground, predictions, trace.detection, laps.end, learned, resting
+        )
         trace.observation = observation
         if self._config.perception.height == "barometer":
             ground = None  # it would only repeat the vehicle's height
@@ -220,6 +225,12 @@ class FlockPilot:
         if self._last_time_s is None or not 0.0 < time_s - self._last_time_s <= _LONGEST_S:
             return ()
         return self._tracker.predictions(time_s - self._last_time_s, self._own.velocity)
+
+    def _near(self, R_ned_body: FloatArray) -> FloatArray:
+        """(n, 3) metres in the body: neighbours, confirmed or not, and obstacles of the last step; where it flies."""
+        neighbours, obstacles = self._tracker.neighbours(), np.pad(self._map.places, ((0, 0), (0, 1)))
+        ahead = [] if self._own.velocity is None else [HORIZON_S * self._own.velocity]
+        return np.array([*(one.position for one in neighbours), *obstacles, *ahead]).reshape(-1, 3) @ R_ned_body
 
     def _ego_motion(
         self, observation: Observation, ground: GroundEstimate | None

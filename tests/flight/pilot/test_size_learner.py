@@ -48,7 +48,7 @@ class Flight:
 
     def observe(
         self, frames: FrameSet, vehicle: VehicleState, ground: Any, predictions: Any, trace: Any, lap: Any,
-        learned_size: LearnedSize | None,
+        learned_size: LearnedSize | None, *_: object,
     ) -> Observation:  # fmt: skip
         """Four drones, at the range at which one of the size that it goes by has their apparent size."""
         self.told.append(learned_size)

@@ -1,0 +1,82 @@
+"""Cameras that rest at short steps, where nothing is near or tracked."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flockd.core.messages import FloatArray
+from flockd.flight.pilot.turns import Turns
+from tests.flight.geometry.synthetic_world import four_camera_rig
+from tests.flight.pilot.flyer import Flyer, scenario_with
+
+RIG = four_camera_rig()
+NOWHERE = np.empty((0, 3))
+LONGEST_REST_S, AROUND_M = 0.5, 1.0
+
+
+def looked(
+    step_s: float, places: FloatArray = NOWHERE, steps: int = 60, rest_s: float = LONGEST_REST_S
+) -> list[set[str]]:
+    """Which cameras are looked at in each step."""
+    turns = Turns(RIG, rest_s, AROUND_M)
+    return [set(RIG.cameras) - turns.resting(7.0 + k * step_s, list(RIG.cameras), lambda: places) for k in range(steps)]
+
+
+@pytest.mark.parametrize(("step_s", "rest_s"), [(0.5, 0.5), (0.6, 0.5), (0.1, 0.1), (0.1, 0.0)])
+def test_no_camera_rests_where_steps_are_as_long_as_a_rest(step_s: float, rest_s: float) -> None:
+    assert all(names == set(RIG.cameras) for names in looked(step_s, rest_s=rest_s))
+
+
+@pytest.mark.parametrize("step_s", [0.05, 0.1, 0.2, 0.25])
+def test_each_side_is_looked_at_in_time_and_half_of_them_in_pairs(step_s: float) -> None:
+    steps = looked(step_s)
+    for name in RIG.cameras:
+        at = [k for k, names in enumerate(steps) if name in names]
+        assert max(np.diff([*at, len(steps)])) * step_s <= LONGEST_REST_S + 1e-9
+    assert all(2 * len(one & other) >= len(RIG.cameras) for one, other in pairwise(steps))
+    assert np.quantile([len(names) for names in steps], 0.95) == 3, "no two that began to rest together end together"
+    assert sum(map(len, steps)) < (2.6 if step_s <= 0.1 else 3.1) * len(steps)
+
+
+@pytest.mark.parametrize("place", [(6.0, 0.0, 0.0), (0.0, -3.0, 0.5), (-4.0, -4.5, 0.0)])
+def test_a_side_with_something_in_view_never_rests(place: tuple[float, ...]) -> None:
+    seeing = RIG.looking_at(np.array([place]), AROUND_M)
+    assert seeing
+    assert all(seeing <= names for names in looked(0.1, np.array([place])))
+
+
+def test_after_a_gap_and_when_time_runs_backwards_all_are_looked_at() -> None:
+    turns, names = Turns(RIG, LONGEST_REST_S, AROUND_M), list(RIG.cameras)
+    some = [bool(turns.resting(time_s, names, lambda: NOWHERE)) for time_s in (3.0, 3.1, 9.0, 8.9, 9.0)]
+    assert some == [False, True, False, False, True]
+    assert not turns.resting(9.1, names[:1], lambda: NOWHERE)
+
+
+def test_a_pilot_at_short_steps_looks_at_fewer_images_and_knows_the_same() -> None:
+    """A drone ahead is seen in each step, and so is the own motion; one that appears behind within a rest."""
+    step_s, cameras = 0.1, len(RIG.cameras)
+    flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (5.0, 0.0, -4.0), (-30.0, 0.0, -4.0)))
+    looks = list[str]()
+
+    def scene(frame: Any, *rest: Any) -> Any:
+        looks.append(frame.camera)
+        return flyer.truth.sound("scene")(frame, *rest)
+
+    flyer.truth.instead["scene"] = scene
+    for step in range(20):
+        if step == 10:
+            flyer.vehicles.position[2] = flyer.vehicles.position[0] + [-4.0, 0.0, 0.0]
+        output = flyer.step()
+        assert output.ego_motion is not None or step == 0
+        assert not [reason.text for reason in output.reasons if step]
+        flyer.vehicles.step(np.tile([1.0, 0.0], (3, 1)), np.zeros(3), step_s)
+        flyer.time_s += step_s
+        flyer.steps += 1
+        assert all(one.unseen_s == 0.0 for one in output.neighbours), "what is known is seen in each step"
+        assert len(output.neighbours) == 1 or step >= 10
+    assert sum(one.confirmed for one in output.neighbours) == 2
+    assert len(looks) < 0.75 * cameras * 20
