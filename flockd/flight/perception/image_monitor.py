@@ -174,6 +174,7 @@ class ImageMonitor:
             for name, camera in cameras.items()
         }
         self._R_ned_body: FloatArray = np.eye(3)
+        self._time_s = -math.inf
 
     def faults(self, images: Mapping[str, UInt8Array], time_s: float, R_ned_body: FloatArray) -> dict[str, Reason]:
         """Cameras whose newest images are not used, and why; to be called once for each moment.
@@ -186,7 +187,7 @@ class ImageMonitor:
             R_ned_body: (3, 3) the drone's attitude then.
         """
         turns = float(np.vdot(self._R_ned_body, R_ned_body)) < 1.0 + 2.0 * math.cos(_MAX_TURN)  # by the trace
-        self._R_ned_body = R_ned_body
+        before_s, self._R_ned_body, self._time_s = self._time_s, R_ned_body, time_s
         shown, verdicts, unexplained = {}, dict[str, _Fault | None](), {}
         for name, image in images.items():
             camera = self._cameras[name]
@@ -196,7 +197,8 @@ class ImageMonitor:
             elif time_s - camera.used_s > _FADES_S:
                 camera.noisiest = None
             verdicts[name] = _Fault.NOISE if self._is_noise(now, camera) else None
-            if camera.last is not None and not (verdicts[name] or turns):
+            # After a rest the drone may have turned further, and the scene changes more than that of other cameras.
+            if camera.last is not None and camera.time_s == before_s and not (verdicts[name] or turns):
                 unexplained[name] = unexplained_share(camera.last, now.small)
             camera.last = None if verdicts[name] else now.small
         for name, share in unexplained.items():

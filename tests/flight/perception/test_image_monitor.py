@@ -183,6 +183,15 @@ def test_all_cameras_at_once_is_a_motion_and_no_damage_and_one_alone_is_not_judg
     assert not any(alone.faults({FIRST: scene(1.2, 40.0, seed=n)}, STEP_S * n, LEVEL) for n in range(3))
 
 
+def test_a_camera_that_rested_may_show_something_else() -> None:
+    rig = ImageMonitor(RIG.cameras, ONLY_DAMAGE)
+    for number in range(1, 8):
+        images = dict.fromkeys(OTHERS, view(number)) | (
+            {FIRST: scene(1.2, 40.0, seed=number)} if number % 3 == 1 else {}
+        )
+        assert not rig.faults(images, 0.1 * number, LEVEL)
+
+
 # Lenses are told by the ground that they showed before.
 
 Spoil = Callable[[UInt8Array], UInt8Array]
