@@ -125,7 +125,7 @@ class PerceptionConfig(Section):
     """Longest time of a network call in flight; a longer one is ended."""
     longest_rest_s: Annotated[float, Field(ge=0, le=1)] = 0.5
     """At shorter steps a camera rests, for at most this time, unless it looks where the drone flies or has a neighbour
-    or an obstacle in view. 0: no camera rests."""
+    in view. 0, or with `obstacles.enabled`: no camera rests."""
     detection: DetectionParameters = DetectionParameters()
     noise: NoiseParameters = NoiseParameters()
     drone_size_m: Annotated[float, Field(ge=MIN_DRONE_SIZE_M, le=MAX_DRONE_SIZE_M)] | None = None

@@ -42,11 +42,6 @@ class LocalMap:
         self._seen_m = np.zeros(SECTORS)
         self._time_s = 0.0
 
-    @property
-    def places(self) -> FloatArray:
-        """(m, 2) metres north and east of the drone: the obstacles' points, as of the last step."""
-        return self._points["place"]
-
     def step(
         self, time_s: float, ranges: ObstacleRanges | None, displacement: FloatArray | None, sigma_m: float
     ) -> ObstacleRanges:

@@ -91,7 +91,8 @@ class FlockPilot:
         by_height = config.perception.scale == "height"
         self._ground = GroundFilter(config.perception.height, config.perception.range_finder) if by_height else None
         self._agreement = CameraAgreement(self._rig)
-        self._turns = Turns(self._rig, config.perception.longest_rest_s, config.safety.gate.min_separation_m)
+        rest_s = 0.0 if config.obstacles.enabled else config.perception.longest_rest_s  # ranges need the flow
+        self._turns = Turns(self._rig, rest_s, config.safety.gate.min_separation_m)
         self._tracker = Tracker(config.tracking, config.safety.gate)
         self._size = SizeLearner(config, learned, flies=flies)
         self._law = FlockingLaw(config.flocking)
@@ -227,10 +228,10 @@ class FlockPilot:
         return self._tracker.predictions(time_s - self._last_time_s, self._own.velocity)
 
     def _near(self, R_ned_body: FloatArray) -> FloatArray:
-        """(n, 3) metres in the body: neighbours, confirmed or not, and obstacles of the last step; where it flies."""
-        neighbours, obstacles = self._tracker.neighbours(), np.pad(self._map.places, ((0, 0), (0, 1)))
+        """(n, 3) metres in the body: neighbours of the last step, confirmed or not, and where the drone flies."""
         ahead = [] if self._own.velocity is None else [HORIZON_S * self._own.velocity]
-        return np.array([*(one.position for one in neighbours), *obstacles, *ahead]).reshape(-1, 3) @ R_ned_body
+        neighbours = [one.position for one in self._tracker.neighbours()]
+        return np.array([*neighbours, *ahead]).reshape(-1, 3) @ R_ned_body
 
     def _ego_motion(
         self, observation: Observation, ground: GroundEstimate | None

@@ -12,9 +12,9 @@ from flockd.flight.geometry import Rig
 class Turns:
     """Which cameras rest in a step.
 
-    A camera with a place of interest in view never rests: a neighbour, an obstacle, where the drone flies. Another one
-    rests for `longest_rest_s` at most, and no two that began together end together. The own motion needs pairs of
-    images: half of the cameras are looked at in this step and were in the step before.
+    A camera with a place of interest in view never rests: a neighbour's, or where the drone flies. Another one rests
+    for `longest_rest_s` at most, and no two that began together end together. The own motion needs pairs of images:
+    half of the cameras are looked at in this step and were in the step before.
     """
 
     def __init__(self, rig: Rig, longest_rest_s: float, around_m: float) -> None:

@@ -12,6 +12,7 @@ from flockd.core.messages import FloatArray
 from flockd.flight.pilot.turns import Turns
 from tests.flight.geometry.synthetic_world import four_camera_rig
 from tests.flight.pilot.flyer import Flyer, scenario_with
+from tests.make import changed
 
 RIG = four_camera_rig()
 NOWHERE = np.empty((0, 3))
@@ -56,10 +57,12 @@ def test_after_a_gap_and_when_time_runs_backwards_all_are_looked_at() -> None:
     assert not turns.resting(9.1, names[:1], lambda: NOWHERE)
 
 
-def test_a_pilot_at_short_steps_looks_at_fewer_images_and_knows_the_same() -> None:
+@pytest.mark.parametrize("obstacles", [False, True])
+def test_a_pilot_at_short_steps_looks_at_fewer_images_and_knows_the_same(obstacles: bool) -> None:
     """A drone ahead is seen in each step, and so is the own motion; one that appears behind within a rest."""
     step_s, cameras = 0.1, len(RIG.cameras)
-    flyer = Flyer(scenario_with((0.0, 0.0, -4.0), (5.0, 0.0, -4.0), (-30.0, 0.0, -4.0)))
+    scenario = scenario_with((0.0, 0.0, -4.0), (5.0, 0.0, -4.0), (-30.0, 0.0, -4.0))
+    flyer = Flyer(scenario.model_copy(update={"drone": changed(scenario.drone, obstacles__enabled=obstacles)}))
     looks = list[str]()
 
     def scene(frame: Any, *rest: Any) -> Any:
@@ -79,4 +82,4 @@ def test_a_pilot_at_short_steps_looks_at_fewer_images_and_knows_the_same() -> No
         assert all(one.unseen_s == 0.0 for one in output.neighbours), "what is known is seen in each step"
         assert len(output.neighbours) == 1 or step >= 10
     assert sum(one.confirmed for one in output.neighbours) == 2
-    assert len(looks) < 0.75 * cameras * 20
+    assert len(looks) == cameras * 20 if obstacles else len(looks) < 0.75 * cameras * 20
