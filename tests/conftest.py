@@ -13,9 +13,8 @@ from typing import Any
 import pytest
 from hypothesis import settings
 
-if (
-    platform.machine() == "x86_64"
-):  # before numpy comes: with the routines for AVX-512, two recorded flights round otherwise
+if platform.machine() == "x86_64":
+    # Before numpy is imported: with its routines for AVX-512, two recorded flights come out otherwise.
     os.environ.setdefault("OPENBLAS_CORETYPE", "Haswell")
 
 from flockd.cli import main

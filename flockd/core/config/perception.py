@@ -124,8 +124,8 @@ class PerceptionConfig(Section):
     deadline_s: Annotated[float, Field(gt=0, le=60)] = 1.0
     """Longest time of a network call in flight; a longer one is ended."""
     longest_rest_s: Annotated[float, Field(ge=0, le=1)] = 0.5
-    """At shorter steps a camera rests, for at most this time, unless it looks where the drone flies or has a neighbour
-    in view. 0, or with `obstacles.enabled`: no camera rests."""
+    """At steps of half this time and less, a camera rests for at most this time, unless it looks where the drone flies
+    or has a neighbour in view. 0, or with `obstacles.enabled`: no camera rests."""
     detection: DetectionParameters = DetectionParameters()
     noise: NoiseParameters = NoiseParameters()
     drone_size_m: Annotated[float, Field(ge=MIN_DRONE_SIZE_M, le=MAX_DRONE_SIZE_M)] | None = None

@@ -26,7 +26,7 @@ class Turns:
     def resting(
         self, time_s: float, with_image: Collection[str], places_body: Callable[[], FloatArray]
     ) -> frozenset[str]:
-        """The cameras with an image that rest at `time_s`: none where steps are as long as a rest.
+        """The cameras with an image that rest at `time_s`: none where two steps are longer than a rest.
 
         `places_body` gives the places of interest (n, 3), metres, body FRD.
         """
