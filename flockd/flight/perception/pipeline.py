@@ -27,7 +27,7 @@ Reasons = list[Reason]
 
 
 class Perception:
-    """One drone's perception. It keeps the last observation; several drones may share the networks."""
+    """One drone's perception. Several drones may share the networks."""
 
     def __init__(self, rig: Rig, networks: Networks, config: PerceptionConfig) -> None:
         self._rig, self._networks, self._config = rig, networks, config
@@ -36,7 +36,8 @@ class Perception:
         self._detector = Detector(rig, networks, config.detection)
         self._needs_ground = config.scale == "height"
         self._monitor = ImageMonitor(rig.cameras, config.noise)
-        self._last: Observation | None = None
+        self.last: Observation | None = None
+        """The newest observation; the next one's flow starts from it."""
 
     def observe(
         self,
@@ -75,9 +76,9 @@ class Perception:
             labels = without_borders(mask, self._config.detection.mask_border_px)
             cameras[name] = CameraObservation(images[name], depths.get(name), labels, flows.get(name))
         reasons = (*without_image, *without_scene, *without_pair, *without_flow, *found.reasons)
-        self._last = Observation(frames.time_s, vehicle, cameras, found.detections, previous, reasons, noisy)
+        self.last = Observation(frames.time_s, vehicle, cameras, found.detections, previous, reasons, noisy)
         lap("detection")
-        return self._last
+        return self.last
 
     def _usable(
         self, frames: FrameSet, vehicle: VehicleState, resting: Container[str]
@@ -130,11 +131,11 @@ class Perception:
 
     def _pair(self, frames: FrameSet) -> tuple[Observation | None, Reasons]:
         """The observation before; None if time runs backwards."""
-        if self._last is None:
+        if self.last is None:
             return None, []
-        if frames.time_s <= self._last.time_s:
+        if frames.time_s <= self.last.time_s:
             return None, [Reason(ReasonKind.PAIR, "time stamps do not increase: the pair starts anew")]
-        return replace(self._last, previous=None), []
+        return replace(self.last, previous=None), []
 
     def _flows(
         self, previous: Observation | None, frames: Mapping[str, Frame]

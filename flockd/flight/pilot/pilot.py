@@ -148,7 +148,9 @@ class FlockPilot:
         predictions = self._predictions(frames.time_s)
         ground, why_no_ground = (None, None) if self._ground is None else self._ground.update(vehicle)
         learned = self._size.learned
-        resting = self._turns.resting(frames.time_s, frames.frames, lambda: self._near(vehicle.R_ned_body))
+        resting = self._turns.resting(
+            frames.time_s, frames.frames, self._perception.last, lambda: self._near(vehicle.R_ned_body)
+        )
         observation = self._perception.observe(
             frames, vehicle, ground, predictions, trace.detection, laps.end, learned, resting
         )

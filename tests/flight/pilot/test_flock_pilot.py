@@ -349,6 +349,8 @@ def test_a_detection_that_the_tracker_refuses_costs_that_neighbour_only() -> Non
     spoilt = replace(detection((0.0, 3.0, 0.0), label=2), drone_probability=1.5)
 
     class Observer:
+        last = None
+
         def observe(self, frames: FrameSet, vehicle: VehicleState, *_: object) -> Observation:
             return Observation(frames.time_s, vehicle, {}, (spoilt, sound), None)
 

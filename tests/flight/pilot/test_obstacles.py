@@ -23,6 +23,8 @@ WALL = Obstacles([Box(3.0, 0.0, 0.2, 30.0, 0.0, -0.5, 8.0)])
 class Observer:
     """Has no images."""
 
+    last = None
+
     def observe(self, frames: FrameSet, vehicle: VehicleState, *_: object) -> Observation:
         return Observation(frames.time_s, vehicle, {}, (), None)
 

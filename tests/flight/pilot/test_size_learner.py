@@ -43,7 +43,7 @@ class Flight:
         self._pilot = FlockPilot(config, networks, observer=observer, learned=learned, flies=flies)
         self.below_m = self.time_s = 0.0
         self._drift: FloatArray = np.zeros_like(PLACES)
-        self._last: Observation | None = None
+        self.last: Observation | None = None
         self.told: list[LearnedSize | None] = []
 
     def observe(
@@ -55,8 +55,8 @@ class Flight:
         self._drift = 0.8 * self._drift + self._random.normal(0.0, 1.0, PLACES.shape) * [0.15, 0.15, 0.02]
         size_m = JUDGED_M if learned_size is None else learned_size.size_m
         found = tuple(self._detection(place, size_m, k + 1) for k, place in enumerate(self.places))
-        self._last = Observation(frames.time_s, vehicle, {}, found, self._last)
-        return self._last
+        self.last = Observation(frames.time_s, vehicle, {}, found, self.last)
+        return self.last
 
     @property
     def places(self) -> FloatArray:
