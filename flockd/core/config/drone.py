@@ -134,12 +134,13 @@ class DroneConfig(Section):
         if self.source is not None and (apart_s := self.source.set_tolerance_s) > self.step_s:
             told = f"{apart_s:g} s is longer than step_s {self.step_s:g}; write a smaller one"
             faults["source", "set_tolerance_s"] = told
-        if self.source is not None and self.source.kind != "shared_memory":
-            faults |= self._device_faults(self.source.cameras)
-            rate_hz = max(camera.rate_hz for camera in self.source.cameras) if self.source.cameras else 1e3
+        if self.source is not None:
+            if self.source.kind != "shared_memory":
+                faults |= self._device_faults(self.source.cameras)
+            rate_hz = max([camera.rate_hz for camera in self.source.cameras] or [self.source.shared_memory.rate_hz])
             if self.step_s * rate_hz < 1.0 and not math.isclose(self.step_s * rate_hz, 1.0):
                 told = f"{self.step_s:g} s is below the {1 / rate_hz:.3f} s between two images of the fastest camera"
-                faults["step_s",] = f"{told}; write a larger one"
+                faults["step_s",] = f"{told}; write a larger one, or a higher rate_hz of the source"
         refuse(self, faults)
         return self
 

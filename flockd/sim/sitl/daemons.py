@@ -33,15 +33,14 @@ def fleet_configs(
     """The configuration of each drone of a scenario that is not flown by hand.
 
     The pilot is the scenario's, with the mission's places counted from the drone's own home, which is below its start;
-    source, autopilot, safety and telemetry are those of ``sitl``, which has all of them.
+    source, autopilot, safety and telemetry are those of ``sitl``, which has all of them; images come for each step.
     """
     assert sitl.source is not None and sitl.autopilot is not None
     configs, fleet = [], re.sub(r"[^A-Za-z0-9_.-]+", "-", scenario.scenario)
-    for i, port in enumerate(ports):
-        if scenario.vehicles[i].by_hand:
-            continue
+    rate_hz = max(sitl.source.shared_memory.rate_hz, 1.0 / scenario.drone.step_s)
+    for i, port in ((i, port) for i, port in enumerate(ports) if not scenario.vehicles[i].by_hand):
         name = f"drone{i + 1}"
-        frames = {"drone": name, "connect": (endpoint,), "speed_factor": speed_factor}
+        frames = {"drone": name, "connect": (endpoint,), "speed_factor": speed_factor, "rate_hz": rate_hz}
         shared_memory = sitl.source.shared_memory.model_copy(update=frames)
         address = {"address": f"udpin://127.0.0.1:{port.offboard}", "system_id": i + 1}
         parts = {

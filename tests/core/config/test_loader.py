@@ -195,6 +195,10 @@ def test_a_slip_in_line_six_is_reported_with_what_to_do(tmp_path: Path, line: st
             f"safety: {{gate: {{command_fresh_s: 0.3}}}}\n{CABLE}",
             "1: step_s: is not given, and by default 0.5 s is above safety.gate.command_fresh_s 0.3",
         ),
+        (
+            "source: {kind: shared_memory, shared_memory: {rate_hz: 1}}",
+            "1: step_s: is not given, and by default 0.5 s is below the 1.000 s between two images of the fastest",
+        ),
         ("safety: {gate: {max_height_m: 0.5}}\nmission: {height_m: 5}", "6: safety.gate: min_height_m 1 is not below"),
         # Of drones that are 3 m wide the tips meet where the middles are 3 m apart.
         (

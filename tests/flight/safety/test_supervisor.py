@@ -10,17 +10,7 @@ from typing import Any, Literal, NamedTuple, Self
 import pytest
 
 from flockd.core.config.safety import SafetyParameters
-from flockd.flight.safety import (
-    OFFBOARD,
-    Action,
-    CameraHealth,
-    Decision,
-    Event,
-    Inputs,
-    State,
-    Supervisor,
-    link_lost,
-)
+from flockd.flight.safety import OFFBOARD, Action, CameraHealth, Decision, Event, Inputs, State, Supervisor, link_lost
 from flockd.flight.safety.events import notice
 from tests.hostile import any_float, hostile
 from tests.make import quiet

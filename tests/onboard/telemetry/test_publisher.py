@@ -16,15 +16,7 @@ import pytest
 import zenoh
 
 from flockd.core.errors import UnavailableError, UsageError
-from flockd.core.messages import (
-    SECTORS,
-    MissionStatus,
-    ObstacleRanges,
-    PilotOutput,
-    Reason,
-    ReasonKind,
-    VehicleState,
-)
+from flockd.core.messages import SECTORS, MissionStatus, ObstacleRanges, PilotOutput, Reason, ReasonKind, VehicleState
 from flockd.onboard.telemetry import TOPICS, publish_step
 from flockd.onboard.telemetry.publisher import ZenohTelemetry
 from flockd.onboard.telemetry.zenoh_session import open_session

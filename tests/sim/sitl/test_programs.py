@@ -15,7 +15,9 @@ import pytest
 from flockd.core.config import load_drone
 from flockd.core.data import data_path
 from flockd.core.errors import UnavailableError
-from flockd.sim.sitl.daemons import Daemons
+from flockd.sim.scenario import load_scenario
+from flockd.sim.sitl.autopilots import Ports
+from flockd.sim.sitl.daemons import Daemons, fleet_configs
 from flockd.sim.sitl.ground_station import GroundStation
 
 PARENT = """\
@@ -89,3 +91,11 @@ def test_recordings_go_where_the_simulator_was_told_though_daemons_run_elsewhere
             assert time.monotonic() < end_s
             time.sleep(0.05)
         assert Path(program.log.read_text(encoding="utf-8").strip()) == tmp_path / "recordings"
+
+
+def test_the_images_of_a_fleet_come_for_each_step() -> None:
+    scenario = load_scenario(data_path("config") / "px4_flight.yaml", {"drone.step_s": 0.2})
+    sitl = load_drone(data_path("config") / "px4_sitl.yaml")
+    ports = [Ports(14540 + i, 15540 + i) for i, _ in enumerate(scenario.vehicles)]
+    configs = fleet_configs(scenario, sitl, ports=ports, endpoint="tcp/127.0.0.1:7448", speed_factor=1.0)
+    assert {(one.step_s, one.source and one.source.shared_memory.rate_hz) for one in configs} == {(0.2, 5.0)}
