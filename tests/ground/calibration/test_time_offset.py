@@ -16,7 +16,7 @@ from tests.onboard.recording.made_up import drone_config
 def test_frames_get_the_attitude_of_their_own_moment() -> None:
     plain = drone_config()
     rig = plain.rig.model_copy(update={"time_offset_s": 0.0437})
-    config = DroneConfig(rig=rig, source=SourceParameters(kind="shared_memory", set_tolerance_s=0.01), step_s=0.01)
+    config = DroneConfig(rig=rig, source=SourceParameters(kind="shared_memory", set_tolerance_s=0.01), step_s=0.1)
     asked = []
 
     def vehicle_at(time_s: float) -> VehicleState | None:
