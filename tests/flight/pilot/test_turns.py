@@ -27,15 +27,16 @@ def looked(
     places: FloatArray = NOWHERE,
     rest_s: float = LONGEST_REST_S,
     names: Collection[str] = RIG.cameras,
+    refused_each: int = 1000,
 ) -> list[set[str]]:
-    """Which cameras with these names are looked at in each step."""
+    """Which cameras with these names are looked at in each step; `refused_each`: some steps' images are not used."""
     turns, last, found = Turns(RIG, rest_s, AROUND_M), None, [set[str]()]
     flow, image = np.zeros((1, 1, 2), np.float32), np.zeros((1, 1), np.uint8)
     for time_s in times_s:
-        before = found[-1] if last is not None and last.time_s < time_s else ()
+        before = last.cameras if last is not None and last.time_s < time_s else ()
         found.append(set(names) - turns.resting(time_s, names, last, lambda: places))
         seen = {name: CameraObservation(image, None, image, flow if name in before else None) for name in found[-1]}
-        last = Observation(time_s, vehicle(height_m=4.0), seen, (), None)
+        last = Observation(time_s, vehicle(height_m=4.0), seen if len(found) % refused_each else {}, (), None)
     return found[1:]
 
 
@@ -68,6 +69,7 @@ def test_after_a_gap_and_when_time_runs_backwards_all_are_looked_at() -> None:
     steps = looked([3.0, 3.1, 3.2, 9.0, 8.9, 9.0, 9.1])
     assert [names == set(RIG.cameras) for names in steps] == [True, True, False, True, True, True, False]
     assert all(looked(0.1 * STEPS, names=["left"])), "the only camera with an image never rests"
+    assert all(len(names) >= 2 for names in looked(0.05 * STEPS, refused_each=7)), "half, though none gave an image"
 
 
 def looks_of(flyer: Flyer, steps: int) -> Iterator[tuple[PilotOutput, set[str]]]:
