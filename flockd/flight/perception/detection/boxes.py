@@ -25,6 +25,8 @@ _SMALL_PX = (20.0, 8.0)
 _SUREST = 0.95
 """Upper limit of a box's probability: a detector that is certain and wrong may not overrule the second stage."""
 _SUREST_ODDS = math.log(_SUREST / (1 - _SUREST))
+_FIRST = 50.0
+"""Added to the score of a detector's boxes: they are proposed before what only the segmentation finds."""
 
 
 @dataclass(frozen=True)
@@ -87,10 +89,9 @@ def kept_boxes(boxes: FloatArray, probability: FloatArray, rules: BoxRules) -> t
 def with_boxes(
     labels: UInt8Array, instances: tuple[Instance, ...], boxes: FloatArray, odds: FloatArray, rules: BoxRules
 ) -> tuple[UInt8Array, tuple[Instance, ...]]:
-    """The drones of a detector's boxes, with the instances' pixels and the detector's evidence.
+    """The instances of an image, with the detector's evidence, and those that only the detector found.
 
-    An instance that is the same drone as a box takes the box. Instances that are parts of one drone are joined. The
-    others are left out, unless there is no box: where the detector works, false ones among them outnumber drones.
+    An instance that is the same drone as a box takes the box. Instances that are parts of one drone are joined.
 
     Args:
         labels: (h, w) of the instances; a changed copy is returned if parts are joined.
@@ -118,8 +119,10 @@ def with_boxes(
             labels[labels == part.label] = same.label
             del left[part.label]
         centre = (box[:2] + box[2:]) / 2
-        found.append(replace(same, box=box, centre=centre, score=float(log_odds), evidence=evidence, boxed=True))
-    return labels, tuple(found or left.values())
+        found.append(
+            replace(same, box=box, centre=centre, score=_FIRST + float(log_odds), evidence=evidence, boxed=True)
+        )
+    return labels, (*found, *left.values())
 
 
 def _is_part(of: FloatArray, box: FloatArray) -> bool:
