@@ -82,7 +82,7 @@ class Passing:
         """
         distance_m, max_speed_m_s = self._law.parameters.separation_distance_m, self._law.parameters.max_speed_m_s
         ranges = np.hypot(offsets[:, 0], offsets[:, 1])
-        near = np.flatnonzero((np.abs(offsets[:, 2]) < self._vertical_m) & (ranges > SAME_SPOT_M)).tolist()
+        near = ((np.abs(offsets[:, 2]) < self._vertical_m) & (ranges > SAME_SPOT_M)).nonzero()[0].tolist()
 
         def plane(one: int, side: float) -> _Plane:
             return _half_plane(velocity, offsets[one, :2], velocity - velocities[one], distance_m, side)

@@ -135,7 +135,7 @@ class PinholeCamera(Camera):
             normalised = self._undistort(normalised)
         x, y = normalised.T
         z = 1.0 / np.sqrt(x * x + y * y + 1.0)
-        return np.stack([x * z, y * z, z], axis=1)
+        return np.array([x * z, y * z, z]).T
 
     def pixel_angle(self, rays: FloatArray) -> FloatArray:
         """(n,) radians: largest across the direction to the axis, where it falls with the cosine."""
@@ -157,13 +157,8 @@ class PinholeCamera(Camera):
         r2 = x * x + y * y
         radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
         radial = np.where(r2 < self._radius_limit**2, radial, np.nan)
-        return np.stack(
-            [
-                x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
-                y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
-            ],
-            axis=1,
-        )
+        right = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
+        return np.array([right, y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y]).T
 
     def _distortion_jacobian(self, normalised: FloatArray) -> FloatArray:
         """(n, 2, 2) derivative of `_distort`, by OpenCV: of pixels by the translation of points at z = 1."""
@@ -180,7 +175,7 @@ class PinholeCamera(Camera):
                 if not np.nanmax(np.abs(error), initial=0.0) > _NEWTON_TOLERANCE:
                     break
                 (a, b), (c, d) = self._distortion_jacobian(estimate).transpose(1, 2, 0)
-                step = np.stack([d * error[:, 0] - b * error[:, 1], a * error[:, 1] - c * error[:, 0]], axis=1)
+                step = np.array([d * error[:, 0] - b * error[:, 1], a * error[:, 1] - c * error[:, 0]]).T
                 estimate = estimate - step / (a * d - b * c)[:, None]
             error = self._distort(estimate) - distorted
             converged = np.abs(error).max(axis=1) < 1e-9

@@ -111,14 +111,14 @@ def refine_ego_motion(pairs: PointPairs, rig: Rig, initial: RigidTransform, agre
     typical = np.concatenate([agreeing, agreeing])  # both ways
     if not typical.any():
         return initial
-    sights, motion = _Sights.of(pairs, rig), initial
+    sights, rotation, translation = _Sights.of(pairs, rig), initial.rotation, initial.translation
     for _ in range(_MOST_STEPS):
-        state = _Reprojection(sights, motion)
-        step = _step(state, typical)
-        motion = RigidTransform(rotation_from_vector(step[:3]), step[3:]) @ motion
+        step = _step(_Reprojection(sights, rotation, translation), typical)
+        turn = rotation_from_vector(step[:3])
+        rotation, translation = turn @ rotation, turn @ translation + step[3:]
         if np.abs(step).max() < _SETTLED:
             break
-    return motion
+    return RigidTransform(rotation, translation)
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +141,7 @@ class _Sights:
         n = len(pairs)
         centres, seen, across = np.empty((3, 2, n)), np.empty((3, 2, n)), np.empty((3, 2, 2, n))
         for name, camera in rig.cameras.items():
-            mine = np.flatnonzero(pairs.camera_names == name)
+            mine = (pairs.camera_names == name).nonzero()[0]
             R = camera.T_body_camera.rotation
             rays = camera.camera.rays(np.concatenate([pairs.pixels_previous[mine], pairs.pixels_current[mine]]))
             centres[:, :, mine] = camera.T_body_camera.translation[:, None, None]
@@ -160,12 +160,13 @@ class _Reprojection:
     """
 
     sights: _Sights
-    motion: RigidTransform
+    rotation: FloatArray
+    translation: FloatArray
 
     @cached_property
     def moved(self) -> FloatArray:
         """(3, m) the points in body axes at the time of the sight."""
-        R, t = self.motion.rotation, self.motion.translation[:, None]
+        R, t = self.rotation, self.translation[:, None]
         return np.concatenate([R @ self.sights.current + t, R.T @ (self.sights.previous - t)], axis=1)
 
     @cached_property
@@ -188,7 +189,7 @@ class _Reprojection:
     @property
     def parallaxes(self) -> FloatArray:
         """(2, m) derivatives by the logarithm of each point's depth in the camera that lifted it."""
-        R, t = self.motion.rotation, self.motion.translation[:, None]
+        R, t = self.rotation, self.translation[:, None]
         centres = self.sights.centres[:, : self.sights.current.shape[1]]
         between = np.concatenate([R @ centres + t, R.T @ (centres - t)], axis=1) - self.sights.centres
         along = (self.sights.seen * between).sum(0)
@@ -204,7 +205,7 @@ class _Reprojection:
         by_point /= self.depths
         by_point[..., np.isnan(self.depths)] = 0.0
         # An increment (w, v) moves X = T P_F by w x X + v, and Y = T^-1 P_C by -R'(w x P_C + v).
-        by_point[..., n:] = -(self.motion.rotation @ by_point[..., n:].reshape(3, -1)).reshape(3, 2, n)
+        by_point[..., n:] = -(self.rotation @ by_point[..., n:].reshape(3, -1)).reshape(3, 2, n)
         turned = np.concatenate([self.moved[:, :n], sights.previous], axis=1)
         return np.concatenate([-crossed(by_point, turned[:, None]), by_point])
 

@@ -11,6 +11,7 @@ import math
 import numpy as np
 
 from flockd.core.messages import FloatArray
+from flockd.flight.geometry.transform import EYE
 
 
 def log_polar(position: FloatArray) -> tuple[FloatArray, float]:
@@ -23,8 +24,8 @@ def log_polar(position: FloatArray) -> tuple[FloatArray, float]:
 
 def log_polar_covariance(bearing: FloatArray, log_range_sigma: float, bearing_sigma_rad: float) -> FloatArray:
     """(3, 3) for independent errors of range and bearing, the bearing's equal in all directions."""
-    along = np.outer(bearing, bearing)
-    covariance: FloatArray = bearing_sigma_rad**2 * (np.eye(3) - along) + log_range_sigma**2 * along
+    along = bearing[:, None] * bearing
+    covariance: FloatArray = bearing_sigma_rad**2 * (EYE - along) + log_range_sigma**2 * along
     return covariance
 
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from flockd.core.messages import FloatArray
 
-_EYE = np.eye(3)
-_TOLERANCE = 1e-6 + 1e-5 * _EYE
+EYE = np.eye(3)
+_TOLERANCE = 1e-6 + 1e-5 * EYE
 """Largest deviation of a rotation times its transpose from the identity."""
 
 
@@ -31,7 +31,7 @@ class RigidTransform:
             raise ValueError(f"a rigid transform is (3, 3) and (3,), not {rotation.shape} and {translation.shape}")
         if not np.isfinite(translation).all():
             raise ValueError("a rigid transform's translation must be finite")
-        is_orthonormal = (np.abs(rotation @ rotation.T - _EYE) <= _TOLERANCE).all()  # NaN is not
+        is_orthonormal = (np.abs(rotation @ rotation.T - EYE) <= _TOLERANCE).all()  # NaN is not
         (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
         if not is_orthonormal or a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) < 0.0:
             raise ValueError("the matrix is not a rotation: its columns must be orthonormal and right-handed")

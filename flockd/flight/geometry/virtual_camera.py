@@ -92,7 +92,7 @@ class VirtualCrops:
         to_virtual[:, 2, 2] = 1.0
         to_body = self.R_body_virtual @ to_virtual
         # One contiguous array for each coordinate.
-        towards = (to_body.transpose(1, 0, 2).reshape(-1, 3) @ pixels).reshape(3, len(self.main), -1)
+        towards = (to_body.transpose(1, 0, 2).reshape(-1, 3) @ pixels).reshape(3, len(self.main), pixels.shape[1])
         where = np.full((2, *towards.shape[1:]), np.nan, np.float32)
         for index, camera in self._with(images):
             if index in self.main:
@@ -100,7 +100,7 @@ class VirtualCrops:
                 seen = camera.pixels_of_directions(towards[:, crops].reshape(3, -1).T)
                 where[:, crops] = seen.T.reshape(2, len(crops), -1)
         source = np.where(np.isnan(where[0]), _NOWHERE, self.main[:, None])
-        missing = np.flatnonzero(source == _NOWHERE)
+        missing = (source == _NOWHERE).ravel().nonzero()[0]
         if not len(missing):
             return source, where
         crop = missing // pixels.shape[1]

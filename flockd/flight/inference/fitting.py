@@ -70,13 +70,13 @@ def fit(manifest: Manifest, image: Size) -> Fitting:
     return Fitting(image, inner, (inner[0] + -inner[0] % multiple, inner[1] + -inner[1] % multiple))
 
 
-def entering(spec: InputSpec, images: Sequence[UInt8Array]) -> NDArray[Any]:
-    """Converts RGB images (h, w, 3) of the input's size to its batch, in its colour, layout and scale."""
+def entering(spec: InputSpec, images: Sequence[UInt8Array] | NDArray[Any]) -> NDArray[Any]:
+    """Converts n RGB images (h, w, 3) of the input's size to its batch, in its colour, layout and scale."""
     if spec.colour == "bgr":
         images = [image[..., ::-1] for image in images]
     elif spec.colour == "grey":
         images = [np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)[..., None] for image in images]
-    batch: NDArray[Any] = np.array(images)
+    batch: NDArray[Any] = np.asarray(images)
     if spec.dtype != "uint8":
         batch = batch.astype(np.float32) * np.float32(spec.white / 255.0)
         if spec.mean:

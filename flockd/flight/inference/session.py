@@ -105,15 +105,15 @@ class OnnxModel:
                 raise FloatingPointError(f"model {self.manifest.name}: output {name} is not finite")
         return outputs
 
-    def infer(self, contents: Mapping[str, Sequence[UInt8Array] | Float32Array]) -> dict[str, Float32Array]:
+    def infer(self, contents: Mapping[str, Sequence[UInt8Array] | NDArray[Any]]) -> dict[str, Float32Array]:
         """The outputs by their content, in their units; ``contents`` has the inputs by theirs.
 
-        Images are (h, w, 3) RGB of the input's size, planes (n, c, h, w). Raises as ``run`` does.
+        Images are n times (h, w, 3) RGB of the input's size, planes (n, c, h, w). Raises as ``run`` does.
         """
         feeds = {}
         for name, spec in self.manifest.inputs.items():
             content = contents[spec.carries or name]
-            feeds[name] = content if isinstance(content, np.ndarray) else entering(spec, content)
+            feeds[name] = np.asarray(content) if spec.kind == "planes" else entering(spec, content)
         specs = self.manifest.outputs
         return {specs[name].gives or name: leaving(specs[name], value) for name, value in self.run(feeds).items()}
 

@@ -73,7 +73,7 @@ class LocalMap:
 
     def _take(self, ranges: ObstacleRanges) -> None:
         p = self._parameters
-        found = np.flatnonzero(ranges.range_m <= p.range_m)
+        found = (ranges.range_m <= p.range_m).nonzero()[0]
         new = np.zeros(len(found), _POINT)
         new["place"] = ranges.range_m[found, None] * DIRECTIONS[found]
         new["sigma_m"], new["seen_s"] = ranges.sigma_m[found], ranges.time_s

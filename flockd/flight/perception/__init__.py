@@ -1,7 +1,7 @@
 """Perception: frames in, an observation out; each role is an ONNX model with a manifest."""
 
 from flockd.flight.perception.interface import (
-    Crop,
+    Crops,
     ImagePair,
     ImageView,
     Networks,
@@ -15,7 +15,7 @@ from flockd.flight.perception.onnx import OnnxNetworks, load_networks
 from flockd.flight.perception.pipeline import Perception
 
 __all__ = [
-    "Crop",
+    "Crops",
     "ImagePair",
     "ImageView",
     "Networks",

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flockd.core.messages import UNCLASSED, BoolArray, Float32Array, UInt8Array
+from flockd.flight.geometry.robust.kernels import median
 from flockd.flight.inference.fitting import fit
 from flockd.flight.inference.session import OnnxModel
 
@@ -138,9 +139,9 @@ def _followed(
     found = (status.reshape(shape) > 0) & np.isfinite(end).all(axis=2).reshape(shape)
     moved = np.where(found[..., None], (end - begin).reshape(points.shape), start)
     change = moved - start
-    usual = np.stack([cv2.medianBlur(np.ascontiguousarray(change[..., axis]), 3) for axis in (0, 1)], axis=2)
+    usual = cv2.merge([cv2.medianBlur(axis, 3) for axis in cv2.split(change)])
     astray = np.abs(change - usual).sum(axis=2) / _ASTRAY_PX
-    if len(alone := np.flatnonzero(found & (astray > _ALONE))):
+    if len(alone := (found & (astray > _ALONE)).ravel().nonzero()[0]):
         there = end[alone]
         back, seen, _ = _tracked(second, first, there, there - (start + usual).reshape(-1, 1, 2)[alone])
         returns = (seen[:, 0] > 0) & (np.abs(back - begin[alone]).sum(axis=(1, 2)) < _RETURNS_PX)
@@ -197,8 +198,8 @@ def _homography_flow(points: Float32Array, moved: Float32Array, weight: Float32A
     if found is None:
         return none
     along = (cv2.perspectiveTransform(points, np.asarray(found, np.float64)) - points).astype(np.float32)
-    off = np.linalg.norm(along - moved, axis=2)
-    usable = np.isfinite(along).all() and np.median(off) < _HOMOGRAPHY_MAX_ERROR * width and off.max() < width
+    off = np.sqrt(((along - moved) ** 2).sum(axis=2))
+    usable = np.isfinite(along).all() and median(off.ravel()) < _HOMOGRAPHY_MAX_ERROR * width and off.max() < width
     return along if usable else none
 
 

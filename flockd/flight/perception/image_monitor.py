@@ -121,7 +121,7 @@ def shown_in(image: UInt8Array, parameters: NoiseParameters, downwards: FloatArr
     number = np.count_nonzero(ground)
     if number >= _LEAST_BLOCKS:
         brightness = _DARK + cv2.resize(rest, (columns, rows), interpolation=cv2.INTER_AREA)
-        shares = np.stack([coarsest, middle]) / brightness
+        shares = np.array([coarsest, middle]) / brightness
         contrast, detail = np.sort(shares[:, ground], axis=1)[:, int(_QUANTILE * number)].tolist()
         clarity = np.array([contrast, detail / max(contrast, _FAINTEST)])
     return Shown(np.count_nonzero(white) / white.size, np.count_nonzero(rough) / rough.size, clarity, small)

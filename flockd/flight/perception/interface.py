@@ -11,8 +11,9 @@ import cv2
 import numpy as np
 
 from flockd.core.errors import ModelError
-from flockd.core.messages import Float32Array, FloatArray, Frame, UInt8Array
+from flockd.core.messages import BoolArray, Float32Array, FloatArray, Frame, UInt8Array
 from flockd.flight.geometry import RigCamera, ZMap
+from flockd.flight.geometry.pairs import Columns
 from flockd.flight.inference import Manifest
 from flockd.flight.inference.manifest import CropSpec
 from flockd.flight.perception.detection.instances import Instance
@@ -33,20 +34,26 @@ class SceneMaps:
     instances: tuple[Instance, ...]
 
 
-class Crop(NamedTuple):
-    """An image of one region of interest, taken by a virtual pinhole camera that faces it."""
+@dataclass(frozen=True, eq=False)
+class Crops(Columns):
+    """Images of n regions of interest, taken by virtual pinhole cameras that each face one."""
 
-    image: UInt8Array
-    """(size, size, 3) RGB"""
-    focal_px: float
+    images: UInt8Array
+    """(n, size, size, 3) RGB"""
+    focal_px: FloatArray
+    """(n,)"""
     R_body_camera: FloatArray
-    """(3, 3) from optical RDF to body FRD."""
-    centre: FloatArray
-    """(3,) optical centre, metres in the body."""
-    mirrored: bool = False
-    """Whether the network gets the mirror image, on which its errors differ. The estimate is for the crop itself."""
-    evidence: float = 0.0
-    """Log odds of a drone known before; they are added to the crop's."""
+    """(n, 3, 3) from optical RDF to body FRD."""
+    centres: FloatArray
+    """(n, 3) optical centres, metres in the body."""
+    mirrored: BoolArray
+    """(n,) whether the network gets the mirror image, on which its errors differ. The estimate is for the crop itself.
+    """
+    evidence: FloatArray
+    """(n,) log odds of a drone known before; they are added to the crop's."""
+
+    def __len__(self) -> int:
+        return len(self.images)
 
 
 class RangeEstimates(NamedTuple):
@@ -146,7 +153,7 @@ class Networks(Protocol):
         """Depth and drones of each image, or one of `CAMERA_FAULTS`."""
         ...
 
-    def ranges(self, crops: Sequence[Crop]) -> RangeEstimates:
+    def ranges(self, crops: Crops) -> RangeEstimates:
         """Range and centre of the drone in the middle of each crop.
 
         All but the probability may be NaN if that is at most `another_crop_probability`.

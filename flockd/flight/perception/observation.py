@@ -65,10 +65,10 @@ class Observation:
         assert now.flow is not None
         column, row = start.astype(np.int64).T
         end = start + now.flow[row, column]
-        still = np.flatnonzero(lens.in_image(end) & (before.cameras[camera.name].labels[row, column] == 0))
+        still = (lens.in_image(end) & (before.cameras[camera.name].labels[row, column] == 0)).nonzero()[0]
         start, end = start.take(still, axis=0), end.take(still, axis=0)
         column, row = end.astype(np.int64).T
-        background = np.flatnonzero(now.labels[row, column] == 0)
+        background = (now.labels[row, column] == 0).nonzero()[0]
         mount = camera.T_body_camera
         between = mount.inverse() @ RigidTransform(ego.rotation, ego.translation) @ mount
         rays = lens.rays(end.take(background, axis=0))

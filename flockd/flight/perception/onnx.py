@@ -22,7 +22,7 @@ from flockd.flight.inference.session import Deadline, OnnxModel, no_deadline
 from flockd.flight.perception.detection.boxes import BoxRules, kept_boxes, probable_boxes, with_boxes
 from flockd.flight.perception.detection.instances import group_instances
 from flockd.flight.perception.flow import DisFlow, OnnxFlow, grid_flow
-from flockd.flight.perception.interface import Crop, OneByOne, RangeEstimates, SceneMaps, SecondStage
+from flockd.flight.perception.interface import Crops, OneByOne, RangeEstimates, SceneMaps, SecondStage
 
 CROPS_PER_RUN = 24
 """Crops in one run of a network, so that an image full of false proposals takes no more memory."""
@@ -103,12 +103,14 @@ class OnnxNetworks(OneByOne):
             labels, instances = with_boxes(labels, instances, boxes, odds, self._box_rules)
         return SceneMaps(self._depth_of(depth, camera), labels, instances)
 
-    def ranges(self, crops: Sequence[Crop]) -> RangeEstimates:
+    def ranges(self, crops: Crops) -> RangeEstimates:
         """See `Networks`."""
-        if not crops:
-            return RangeEstimates.unknown(0)
-        images = [np.ascontiguousarray(c.image[:, ::-1]) if c.mirrored else c.image for c in crops]
-        logits, limit = np.array([crop.evidence for crop in crops]), math.inf
+        estimates, images = RangeEstimates.unknown(len(crops)), crops.images
+        if not len(crops):
+            return estimates
+        if crops.mirrored.any():
+            images = np.where(crops.mirrored[:, None, None, None], images[:, :, ::-1], images)
+        logits, limit = crops.evidence, math.inf
         if self._verification is not None:
             outputs = _in_batches(self._verification, images)["drone"]
             logits = logits + self._verification.manifest.results["drone"].by_column(outputs)["drone_logit"]
@@ -116,18 +118,15 @@ class OnnxNetworks(OneByOne):
             limit = judge.manifest.thresholds["distance_logit_limit"]
         # Without a drone no range is needed: most crops of a cluttered image end here.
         most = _probability(logits + limit)
-        rest = np.flatnonzero(most > self.second_stage.another_crop_probability).tolist()
-        middles = np.full((len(crops), 2), self.second_stage.crop_size / 2)
-        estimates = RangeEstimates.unknown(len(crops))._replace(centre=middles, drone_probability=most)
-        if rest:
-            ranged = self._ranges([crops[k] for k in rest], [images[k] for k in rest], logits[rest], limit)
+        rest = (most > self.second_stage.another_crop_probability).nonzero()[0]
+        estimates.centre[:], estimates.drone_probability[:] = self.second_stage.crop_size / 2, most
+        if len(rest):
+            ranged = self._ranges(crops[rest], images[rest], logits[rest], limit)
             for column, values in zip(estimates, ranged, strict=True):
                 column[rest] = values
         return estimates
 
-    def _ranges(
-        self, crops: Sequence[Crop], images: Sequence[UInt8Array], logits: FloatArray, limit: float
-    ) -> RangeEstimates:
+    def _ranges(self, crops: Crops, images: UInt8Array, logits: FloatArray, limit: float) -> RangeEstimates:
         """The distance network's estimates from crops, given their images as its input.
 
         Its own log odds of a drone are added to ``logits`` (n,), up to ``limit``: log odds of independent evidence add.
@@ -136,13 +135,12 @@ class OnnxNetworks(OneByOne):
         columns = self._distance.manifest.results["range"].by_column(outputs)
         values = {name: np.asarray(column, np.float64) for name, column in columns.items()}
         evidence = logits + np.clip(values["drone_logit"], -limit, limit)
-        mirrored, focal_px = np.array([(crop.mirrored, crop.focal_px) for crop in crops]).T
-        right = np.where(mirrored, -values["right_px"], values["right_px"])  # mirrored back
+        right = np.where(crops.mirrored, -values["right_px"], values["right_px"])  # mirrored back
         size_sigma = np.exp(values.get("log_size_sigma", np.full(len(crops), -np.inf)))
         return RangeEstimates(
-            log_range=values["log_range_per_focal"] + np.log(focal_px),
+            log_range=values["log_range_per_focal"] + np.log(crops.focal_px),
             log_range_sigma=np.exp(values["log_relative_sigma"]),
-            centre=np.stack([right, values["down_px"]], 1) + len(crops[0].image) / 2,
+            centre=np.array([right, values["down_px"]]).T + self.second_stage.crop_size / 2,
             size_m=np.exp(values["log_range_per_focal"] + values["log_apparent_size"]),
             drone_probability=_probability(evidence),
             log_size_sigma=np.minimum(size_sigma, _MOST_SIZE_SIGMA),
@@ -184,7 +182,7 @@ class OnnxNetworks(OneByOne):
         width, height = image[0] // self.map_stride, image[1] // self.map_stride
         if maps.shape[1:] == (height, width):
             return maps
-        resized = np.stack([cv2.resize(plane, (width, height), interpolation=cv2.INTER_LINEAR) for plane in maps])
+        resized = np.array([cv2.resize(plane, (width, height), interpolation=cv2.INTER_LINEAR) for plane in maps])
         if len(maps) == 2:
             resized *= np.array([width / maps.shape[2], height / maps.shape[1]], np.float32)[:, None, None]
         return np.asarray(resized, dtype=np.float32)
@@ -259,7 +257,7 @@ def _one_of(role: Role, folder: Path) -> str:
     return f"choose one of {', '.join(known)}" if known else "name another"
 
 
-def _in_batches(model: OnnxModel, images: Sequence[UInt8Array]) -> dict[str, Float32Array]:
+def _in_batches(model: OnnxModel, images: UInt8Array) -> dict[str, Float32Array]:
     """A model's outputs (n, ...) for all crops."""
     batches = [images[i : i + CROPS_PER_RUN] for i in range(0, len(images), CROPS_PER_RUN)]
     outputs = [model.infer({"crop": batch}) for batch in batches]

@@ -99,7 +99,7 @@ class Gate:
         velocity = start.velocity + limit_norm(target - start.velocity, p.max_acceleration_m_s2 * elapsed_s)
         separation_m = p.min_separation_m if action is Action.FLY else p.degraded_separation_m
         directions, most_m_s, there = limits_around(p, around, separation_m, self.response.late_s)
-        objections.extend(dict.fromkeys(there[i] for i in np.flatnonzero(directions @ velocity > most_m_s)))
+        objections.extend(dict.fromkeys(there[i] for i in (directions @ velocity > most_m_s).nonzero()[0]))
         velocity = nearest_within(velocity, directions, most_m_s)
         if not all(map(math.isfinite, (*velocity, height_m, yaw_rad))):
             return Verdict(None, (*objections, Objection.SETPOINT_NOT_FINITE))

@@ -12,7 +12,7 @@ from typing import Any, TypeVar, cast
 from flockd.core.config import DroneConfig
 from flockd.core.messages import Float32Array
 from flockd.flight.perception import (
-    Crop,
+    Crops,
     ImagePair,
     ImageView,
     OneByOne,
@@ -81,7 +81,7 @@ class WatchedNetworks:
         """Depth and drones of each image."""
         return self._counted(self._each("scene", self._networks.scene, views))
 
-    def ranges(self, crops: Sequence[Crop]) -> RangeEstimates:
+    def ranges(self, crops: Crops) -> RangeEstimates:
         """Range and centre of the drone in the middle of each crop; all in one batch."""
         (result,) = self._counted(self._each("ranges", self._networks.ranges, [(crops,)]))
         if isinstance(result, Exception):

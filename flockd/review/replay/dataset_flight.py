@@ -29,7 +29,7 @@ from flockd.flight.geometry import (
     build_rig,
     rotation_angle_deg,
 )
-from flockd.flight.perception import Crop, OneByOne, RangeEstimates, SceneMaps, load_networks
+from flockd.flight.perception import Crops, OneByOne, RangeEstimates, SceneMaps, load_networks
 from flockd.flight.pilot import FlockPilot
 from flockd.ground.datasets.image_folder import Dataset, DatasetFrame
 from flockd.review.flight_log.log import spread
@@ -150,7 +150,7 @@ class RecordedDepth(OneByOne):
         scene = self._learned.scene(frame, camera, ground)
         return scene if self._depth is None else replace(scene, depth=self._depth)
 
-    def ranges(self, crops: Sequence[Crop]) -> RangeEstimates:
+    def ranges(self, crops: Crops) -> RangeEstimates:
         """The network's ranges."""
         return self._learned.ranges(crops)
 

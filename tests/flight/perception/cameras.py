@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 
 from flockd.core.data import data_path
 from flockd.core.messages import FloatArray, UInt8Array
 from flockd.flight.inference import load_manifest
-from flockd.flight.perception import Crop
+from flockd.flight.perception import Crops
 from flockd.flight.perception.interface import SecondStage
 from flockd.sim.renderer.drone_models import drone_model
 from flockd.sim.renderer.renderer import Renderer, View
@@ -19,8 +21,10 @@ SECOND_STAGE = SecondStage.of(load_manifest(data_path("models") / "distance_int8
 """The interface of the shipped second stage, for fakes that stand in its place."""
 
 
-def crop_of(image: UInt8Array, focal_px: float, *, mirrored: bool = False) -> Crop:
-    return Crop(np.ascontiguousarray(image), focal_px, np.eye(3), np.zeros(3), mirrored)
+def crops_of(images: Sequence[UInt8Array], focal_px: float) -> Crops:
+    n = len(images)
+    turns, no = np.tile(np.eye(3), (n, 1, 1)), np.zeros(n)
+    return Crops(np.array(images), np.full(n, focal_px), turns, np.zeros((n, 3)), no > 0, no)
 
 
 def rendered(

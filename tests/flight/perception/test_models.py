@@ -17,10 +17,10 @@ from flockd.core.errors import ModelError
 from flockd.core.messages import FloatArray, Frame, UInt8Array
 from flockd.flight.inference import OnnxModel, find_manifests, load_manifest
 from flockd.flight.inference.manifest_file import read_manifest
-from flockd.flight.perception import Crop, OnnxNetworks
+from flockd.flight.perception import Crops, OnnxNetworks
 from flockd.flight.perception.flow import DisFlow, OnnxFlow, grid_flow
 from flockd.flight.perception.interface import RangeEstimates
-from tests.flight.perception.cameras import crop_of, rendered
+from tests.flight.perception.cameras import crops_of, rendered
 from tests.make import rig_camera
 from tools.measure.labelled import half_overlap
 
@@ -103,8 +103,7 @@ def test_the_twins_in_8_bits_say_what_the_float_networks_say() -> None:
     assert np.median(np.abs(our.depth / their.depth - 1)[their.depth < 50]) < 0.04
     both, any_ = ((f(our.labels > 0, their.labels > 0)).sum() for f in (np.logical_and, np.logical_or))
     assert both / any_ > 0.8
-    windows = [image[v - 48 : v + 48, u - 48 : u + 48] for u, v in ((86, 130), (234, 190))]
-    pictures = [crop_of(window, 222.0) for window in windows]
+    pictures = crops_of([image[v - 48 : v + 48, u - 48 : u + 48] for u, v in ((86, 130), (234, 190))], 222.0)
     mine, others = ours.ranges(pictures), theirs.ranges(pictures)
     assert (others.drone_probability > 0.5).all()
     assert mine.log_range == pytest.approx(others.log_range, abs=0.05)
@@ -129,14 +128,14 @@ def test_the_network_of_flow_is_made_exact_as_configured() -> None:
 # The verification network beside the distance network: what it adds, and what it leaves alone.
 
 
-def crops() -> list[Crop]:
+def crops() -> Crops:
     """A drone before the sky, one before the ground, and ground alone."""
     taken = []
     for down_m, shown in ((-0.25, True), (0.35, True), (0.8, False)):
         pitch, _ = cv2.Rodrigues(np.array([0.0, -math.atan2(down_m, 1.5), 0.0]))
         view = rendered(100.0, (96, 96), *[(1.5, 0.0, -4.0 + down_m)] * shown, turned=np.asarray(pitch))
-        taken.append(crop_of(view.rgb, 100.0))
-    return taken
+        taken.append(view.rgb)
+    return crops_of(taken, 100.0)
 
 
 def ranges(models: Path = MODELS, **names: str) -> RangeEstimates:

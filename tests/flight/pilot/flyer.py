@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, cast
 
 import numpy as np
@@ -11,7 +11,7 @@ import pytest
 from flockd.core.data import data_path
 from flockd.core.messages import Float32Array, Frame, FrameSet, PilotOutput, UInt8Array, VehicleState
 from flockd.flight.geometry import RigCamera
-from flockd.flight.perception import Crop, Perception, RangeEstimates, SceneMaps
+from flockd.flight.perception import Crops, Perception, RangeEstimates, SceneMaps
 from flockd.flight.pilot import FlockPilot
 from flockd.sim.cameras import camera_simulator
 from flockd.sim.cameras.camera_simulator import CameraSimulator
@@ -54,7 +54,7 @@ class SpoilableTruth(TrueNetworks):
     def scene(self, frame: Frame, camera: RigCamera, ground: Float32Array | None) -> SceneMaps:
         return cast("SceneMaps", self.instead.get("scene", super().scene)(frame, camera, ground))
 
-    def ranges(self, crops: Sequence[Crop]) -> RangeEstimates:
+    def ranges(self, crops: Crops) -> RangeEstimates:
         return cast("RangeEstimates", self.instead.get("ranges", super().ranges)(crops))
 
 

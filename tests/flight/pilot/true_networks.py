@@ -10,7 +10,7 @@ import numpy as np
 
 from flockd.core.messages import Float32Array, FloatArray, Frame, UInt8Array
 from flockd.flight.geometry import RigCamera, ZMap
-from flockd.flight.perception import Crop, OneByOne, RangeEstimates, SceneMaps
+from flockd.flight.perception import Crops, OneByOne, RangeEstimates, SceneMaps
 from flockd.flight.perception.detection.instances import Instance
 from flockd.sim.cameras.camera_simulator import CameraSimulator
 from flockd.sim.renderer.renderer import Renderer, View, true_flow
@@ -74,11 +74,11 @@ class TrueNetworks(OneByOne):
         depth = ZMap(np.where(np.isfinite(view.depth), view.depth, np.float32(_SKY_M)))
         return SceneMaps(depth=depth, labels=view.ids, instances=tuple(self._instances(camera)))
 
-    def ranges(self, crops: Sequence[Crop]) -> RangeEstimates:
+    def ranges(self, crops: Crops) -> RangeEstimates:
         """The true range of the drone nearest to each crop's middle."""
         found = RangeEstimates.unknown(len(crops))
-        for k, crop in enumerate(crops):
-            found.log_range[k], found.centre[k], found.drone_probability[k] = self._range(crop)
+        for k in range(len(crops)):
+            found.log_range[k], found.centre[k], found.drone_probability[k] = self._range(crops[[k]])
         size, certain = np.full(len(crops), _SIZE_M), np.zeros(len(crops))
         return found._replace(log_range_sigma=np.full(len(crops), 0.001), size_m=size, log_size_sigma=certain)
 
@@ -96,16 +96,16 @@ class TrueNetworks(OneByOne):
             found.append(Instance(drone + 1, centre, box, float(rows.size)))
         return sorted(found, key=lambda one: -one.area_px)
 
-    def _range(self, crop: Crop) -> tuple[float, FloatArray, float]:
-        """Log range, centre and probability."""
-        size, drawn = len(crop.image), next(iter(self._now.values()))
+    def _range(self, crop: Crops) -> tuple[float, FloatArray, float]:
+        """Log range, centre and probability of one crop."""
+        size, drawn = crop.images.shape[1], next(iter(self._now.values()))
         views = [one.view for one in self._now.values()]
         visible = [d for d in drawn.shown if any((view.ids == d + 1).sum() >= _MIN_PIXELS for view in views)]
         if not visible:
             return 0.0, np.full(2, size / 2), 0.0
         (own,) = set(range(len(drawn.drone_positions))) - set(drawn.shown)
         in_body = (drawn.drone_positions[visible] - drawn.drone_positions[own]) @ drawn.drone_rotations[own]
-        in_view = (in_body - crop.centre) @ crop.R_body_camera
+        in_view = (in_body - crop.centres) @ crop.R_body_camera[0]
         ranges = np.linalg.norm(in_view, axis=1)
         point = in_view[np.argmax(in_view[:, 2] / ranges)]
         log_range = float(np.log(np.linalg.norm(point)))

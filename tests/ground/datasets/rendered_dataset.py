@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from flockd.core.messages import Float32Array, FloatArray, Frame, UInt8Array
 from flockd.flight.geometry import RigCamera, ZMap
-from flockd.flight.perception import Crop, OneByOne, RangeEstimates, SceneMaps
+from flockd.flight.perception import Crops, OneByOne, RangeEstimates, SceneMaps
 from flockd.flight.perception.flow import DisFlow
 from flockd.sim.renderer.renderer import Renderer
 from flockd.sim.world.world import World
@@ -75,7 +75,7 @@ class Onlooker(OneByOne):
         depth = np.minimum(next(self._depth), 1000.0).astype(np.float32)
         return SceneMaps(ZMap(depth), np.zeros(frame.image.shape[:2], np.uint8), ())
 
-    def ranges(self, crops: Sequence[Crop]) -> RangeEstimates:
+    def ranges(self, crops: Crops) -> RangeEstimates:
         return RangeEstimates.unknown(0)
 
 

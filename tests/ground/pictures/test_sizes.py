@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,7 @@ from flockd.core.config.perception import PerceptionConfig
 from flockd.core.data import data_path
 from flockd.flight.inference import OnnxModel
 from flockd.flight.perception import load_networks
-from flockd.flight.perception.interface import Crop, RangeEstimates
+from flockd.flight.perception.interface import Crops, RangeEstimates
 from flockd.flight.perception.onnx import OnnxNetworks
 from flockd.ground.datasets.image_files import read_image
 from flockd.ground.pictures.single_frame import KNOWN_LOG_SIZE_SIGMA, UNKNOWN_LOG_SIZE_SIGMA, PictureDetector
@@ -32,7 +31,7 @@ class Doubtful:
     def __getattr__(self, name: str) -> object:
         return getattr(self._networks, name)
 
-    def ranges(self, crops: Sequence[Crop]) -> RangeEstimates:
+    def ranges(self, crops: Crops) -> RangeEstimates:
         return self._networks.ranges(crops)._replace(log_size_sigma=np.full(len(crops), self._sigma))
 
 

@@ -7,7 +7,7 @@ import json
 import socket
 import threading
 import time
-from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -29,7 +29,7 @@ from flockd.core.config.source import SharedMemoryParameters, SourceParameters
 from flockd.core.messages import Float32Array, Frame, UInt8Array
 from flockd.fleet.watcher import FleetWatcher, Heard
 from flockd.flight.geometry import RigCamera, ZMap
-from flockd.flight.perception import Crop, OneByOne, RangeEstimates, SceneMaps
+from flockd.flight.perception import Crops, OneByOne, RangeEstimates, SceneMaps
 from flockd.onboard.autopilot.refusal_reasons import REASONS
 from flockd.onboard.daemon import Daemon, ServiceManager
 from flockd.onboard.sources import FramePublisher
@@ -104,7 +104,7 @@ class TinyPerceiver(OneByOne):
         depth = (5.0 + 0.02 * rows + 0.01 * columns).astype(np.float32)
         return SceneMaps(ZMap(depth), np.zeros((height, width), np.uint8), ())
 
-    def ranges(self, crops: Sequence[Crop]) -> RangeEstimates:
+    def ranges(self, crops: Crops) -> RangeEstimates:
         return RangeEstimates.unknown(0)
 
 

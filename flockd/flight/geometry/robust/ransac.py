@@ -77,7 +77,7 @@ def _hypotheses(
 ) -> tuple[FloatArray, FloatArray]:
     """Motions (b, 3, 3), (b, 3) that fit random triples best (Eq. 18-20), without collinear triples."""
     triples = random.integers(0, len(source), (count, 3))  # one that has a point twice has no area
-    corners = np.stack([source[triples], target[triples]])
+    corners = np.array([source[triples], target[triples]])
     a, b = corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0]
     longest2 = np.maximum.reduce([(side**2).sum(axis=-1) for side in (a, b, a - b)])
     doubled_area = np.linalg.norm(np.cross(a, b), axis=-1)

@@ -70,11 +70,11 @@ def probable_boxes(
         rules: of the detector.
         scale: pixels of the network's input per pixel of the image, right and down.
     """
-    good = np.flatnonzero(columns["drone_probability"] >= rules.box_probability)
+    good = (columns["drone_probability"] >= rules.box_probability).nonzero()[0]
     right, down, width, height = (
         columns[name][good].astype(float) for name in ("centre_right_px", "centre_down_px", "width_px", "height_px")
     )
-    boxes = np.stack([right - width / 2, down - height / 2, right + width / 2, down + height / 2], 1)
+    boxes = np.array([right - width / 2, down - height / 2, right + width / 2, down + height / 2]).T
     return boxes / np.tile(scale, 2), columns["drone_probability"][good].astype(float)
 
 

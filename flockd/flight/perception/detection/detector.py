@@ -69,17 +69,14 @@ class Detector:
         stage = self._networks.second_stage
         cascade, sure = Cascade(self._networks, self._parameters, known_size, rig, images), stage.drone_probability
         proposals = propose_instances(rig, scenes, stage.rules, self._parameters)
-        first = cascade.refine(proposals)
-        found = [(c.bearing, c.log_range) for c in first.candidates if c.drone_probability >= sure]
-        predicted, unpredicted = propose_predictions(rig, vehicle, predictions, found, stage.rules)
-        second = cascade.refine(predicted)
-        candidates = [*first.candidates, *second.candidates]
+        predicted, unpredicted = propose_predictions(rig, vehicle, predictions, stage.rules)
+        refined = cascade.refine(proposals, predicted)
         trace.proposals += [*proposals, *predicted]
-        trace.candidates += candidates
-        detections, label_of = suppress(candidates, self._parameters, sure)
+        trace.candidates += refined.candidates
+        detections, label_of = suppress(refined.candidates, self._parameters, sure)
         # Only the pixels of sure detections are a drone's; those of the others are of no class.
         of_sure = {one.label for one in detections if one.drone_probability >= sure}
-        none = {proposal.instance for proposal in first.rejected if proposal.instance}
+        none = {proposal.instance for proposal in refined.rejected if proposal.instance}
         masks = {}
         for name, scene in scenes.items():
             labels = {instance: label for instance, label in label_of[name].items() if label in of_sure}

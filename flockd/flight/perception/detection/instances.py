@@ -58,7 +58,7 @@ def group_instances(
     centres = _vote_peaks(votes, (height, width))
     nearest = cKDTree(centres).query(votes)[1]
     sizes = np.bincount(nearest, minlength=len(centres))
-    some = np.flatnonzero(sizes)
+    some = sizes.nonzero()[0]
     count = sizes[some]
     first = np.cumsum(count) - count
     by_centre = np.argsort(nearest, kind="stable")

@@ -11,6 +11,7 @@ import numpy as np
 from flockd.core.config.perception import DetectionParameters
 from flockd.core.messages import UNCLASSED, Detection
 from flockd.flight.geometry import log_polar_covariance, log_polar_residual
+from flockd.flight.geometry.transform import EYE
 from flockd.flight.perception.detection.refinement import Candidate
 
 MAX_DETECTIONS = UNCLASSED - 1
@@ -48,7 +49,7 @@ def are_one_drone(one: Candidate, other: Candidate, parameters: DetectionParamet
     """
     residual = log_polar_residual(other.bearing, other.log_range, one.bearing, one.log_range)
     extent = parameters.drone_extent * max(one.size_m, other.size_m) / min(one.range_m, other.range_m)
-    spread = one.covariance + other.covariance + extent**2 * np.eye(3)
+    spread = one.covariance + other.covariance + extent**2 * EYE
     return float(residual @ np.linalg.solve(spread, residual)) < parameters.suppression_gate**2
 
 

@@ -19,8 +19,6 @@ from flockd.flight.perception.detection.instances import Instance
 from flockd.flight.perception.interface import SceneMaps
 from flockd.flight.tracking import Prediction
 
-_SAME_RANGE = math.log(1.5)
-"""Largest difference of log range between a detection and the neighbour predicted there."""
 _BORDER_PX = 2
 """A box this near to the image's border is cut by it: the first stage's maps have two image pixels a pixel."""
 
@@ -37,6 +35,8 @@ class Proposal:
     """rad, from its centre to its borders."""
     instance: Instance | None = None
     """The first stage's instance; None: the proposal comes from a prediction."""
+    range_m: float = math.nan
+    """As predicted; NaN: not known."""
 
     @property
     def area_px(self) -> float:
@@ -63,25 +63,13 @@ def propose_instances(
 
 
 def propose_predictions(
-    rig: Rig,
-    vehicle: VehicleState,
-    predictions: Iterable[Prediction],
-    detected: Sequence[tuple[FloatArray, float]],
-    rules: CropSpec,
+    rig: Rig, vehicle: VehicleState, predictions: Iterable[Prediction], rules: CropSpec
 ) -> tuple[list[Proposal], list[Reason]]:
-    """Predictions of tracks at which nothing was found, and reasons for those that are left out.
+    """Predictions of tracks that a camera of ``rig`` shows, and reasons for those that are left out.
 
-    Args:
-        rig: the cameras that have an image.
-        vehicle: for the attitude.
-        predictions: of the confirmed tracks.
-        detected: bearing (3,) in the body, and log range in metres, of each drone found so far. One at another range is
-            not the predicted one.
-        rules: for the crops.
+    ``vehicle`` is for the attitude, ``rules`` are for the crops.
     """
     proposals, reasons = [], []
-    bearings = np.array([bearing for bearing, _ in detected]).reshape(-1, 3)
-    log_ranges = np.array([log_range for _, log_range in detected])
     for prediction in predictions:
         place = vehicle.R_ned_body.T @ prediction.position
         try:
@@ -94,12 +82,10 @@ def propose_predictions(
         )
         if not cameras:
             continue
-        finest = pixel_angles(rig, [cameras], bearing[None])
-        fitting = rules.fitting(np.array([prediction.size_m]), np.array([math.exp(log_range)]))
-        half_angle = float(rules.bounded(fitting, finest)[0])
-        same = (angles_between(bearings, bearing) < half_angle) & (np.abs(log_range - log_ranges) < _SAME_RANGE)
-        if not same.any():
-            proposals.append(Proposal(cameras, bearing, half_angle))
+        range_m = math.exp(log_range)
+        fitting = rules.fitting(np.array([prediction.size_m]), np.array([range_m]))
+        half_angle = float(rules.bounded(fitting, pixel_angles(rig, [cameras], bearing[None]))[0])
+        proposals.append(Proposal(cameras, bearing, half_angle, range_m=range_m))
     return proposals, reasons
 
 
@@ -138,6 +124,5 @@ def pixel_angles(rig: Rig, cameras: Sequence[Sequence[str]], directions: FloatAr
 
 
 def angles_between(a: FloatArray, b: FloatArray) -> FloatArray:
-    """(...) rad, between vectors (..., 3)."""
-    lengths = np.linalg.norm(a, axis=-1) * np.linalg.norm(b, axis=-1)
-    return np.asarray(np.arccos(np.clip((a * b).sum(-1) / lengths, -1, 1)))
+    """(...) rad, between unit vectors (..., 3)."""
+    return np.asarray(np.arccos(np.clip((a * b).sum(-1), -1, 1)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,8 +15,10 @@ from flockd.core.config.perception import DetectionParameters
 from flockd.core.messages import BoolArray, FloatArray, IntArray, LearnedSize, Reason, ReasonKind, UInt8Array
 from flockd.flight.geometry import Rig, log_polar_covariance, virtual_crops
 from flockd.flight.perception.detection.proposals import Proposal, angles_between, pixel_angles
-from flockd.flight.perception.interface import Crop, Networks, RangeEstimates
+from flockd.flight.perception.interface import Crops, Networks, RangeEstimates
 
+_SAME_RANGE = math.log(1.5)
+"""Largest difference of log range between a drone that is seen and the one predicted there."""
 LIKELY = 0.5
 """A proposal that is likelier a drone than not is a candidate: the tracker weighs the probability."""
 
@@ -42,7 +45,7 @@ class Candidate:
         """Range from the body's origin."""
         return math.exp(self.log_range)
 
-    @property
+    @cached_property
     def covariance(self) -> FloatArray:
         """(3, 3) as of `Detection.covariance`."""
         return log_polar_covariance(self.bearing, self.log_range_sigma, self.bearing_sigma_rad)
@@ -131,25 +134,25 @@ class Cascade:
         self.reasons: list[Reason] = []
         """Why proposals were dropped."""
 
-    def refine(self, proposals: Sequence[Proposal]) -> Refined:
+    def refine(self, instances: Sequence[Proposal], predicted: Sequence[Proposal]) -> Refined:
         """The drones among the proposals of all cameras, and the proposals that are certainly not drones.
 
         Each proposal gets at least two crops. The later ones are cut to the drone's size and centred on it; the last
-        one is mirrored. If two cameras share the drone, the crops show it whole.
+        one is mirrored. If two cameras share the drone, the crops show it whole. A predicted drone that the first crops
+        of the instances show gets none of its own.
         """
+        proposals = [*instances, *predicted]
         count, of = len(proposals), np.array(proposals, np.object_)
         aims = _Aims(
             np.array([one.direction for one in proposals]).reshape(-1, 3),
             np.array([one.half_angle for one in proposals]),
-            np.full(count, np.nan),
+            np.array([one.range_m for one in proposals]),
         )
         shown = Estimates(np.empty((count, 3)), *np.empty((5, count)))
         # Least probability of the earlier crops, without the first, which may not fit the drone.
         least, rejected, settled = np.ones(count), np.zeros(count, np.bool_), np.zeros(count, np.bool_)
-        at = np.arange(count)
+        at = np.arange(len(instances))
         for number in range(1, self._rules.max_crops + 1):
-            if not len(at):
-                break
             at, estimates = self._estimated(of, at, aims)
             probability = np.minimum(least[at], estimates.drone_probability)
             rejected[at] = probability <= self._stage.another_crop_probability
@@ -157,6 +160,7 @@ class Cascade:
             at, estimates, probability = at[good], estimates.take(good), probability[good]
             repeats = self._aim(of[at], at, aims, estimates)
             if number == 1:
+                at = np.append(at, len(instances) + unseen(predicted, estimates).nonzero()[0])
                 continue
             least[at] = probability
             enough = repeats | (number == self._rules.max_crops)
@@ -164,10 +168,10 @@ class Cascade:
             for column, values in zip(shown, estimates, strict=True):
                 column[at] = values
             at = at[~enough]
-        at, estimates = self._with_mirrored(of, np.flatnonzero(settled), aims, shown)
+        at, estimates = self._with_mirrored(of, settled.nonzero()[0], aims, shown)
         probability = np.minimum(least[at], estimates.drone_probability)
         rejected[at] = probability <= self._stage.another_crop_probability
-        likely = np.flatnonzero(~rejected[at] & (probability > LIKELY))
+        likely = (~rejected[at] & (probability > LIKELY)).nonzero()[0]
         estimates, across = (
             estimates._replace(drone_probability=probability).take(likely),
             self._stage.bearing_sigma_rad,
@@ -180,6 +184,8 @@ class Cascade:
         self, proposals: NDArray[Any], at: IntArray, aims: _Aims, *, mirrored: bool = False
     ) -> tuple[IntArray, Estimates]:
         """The network's estimates from crops of the proposals at these indices, and the indices that have one."""
+        if not len(at):
+            return at, Estimates(np.empty((0, 3)), *np.empty((5, 0)))
         directions, range_m = aims.direction[at], aims.range_m[at]
         views = virtual_crops(self._rig, directions, aims.half_angle[at], self._stage.crop_size)
         seen = (views.main >= 0).nonzero()[0]
@@ -187,11 +193,9 @@ class Cascade:
             self._drop(f"no camera sees the body direction {one.round(3).tolist()}")
         at, views = at[seen], views.take(seen)
         pictures, _ = views.sample(self._images, range_m[seen])
-        fields = pictures, views.focal_px.tolist(), views.R_body_virtual, views.centres, proposals[at]
-        crops = [
-            Crop(image, focal, R, centre, mirrored, one.evidence)
-            for image, focal, R, centre, one in zip(*fields, strict=True)
-        ]
+        evidence = np.array([one.evidence for one in proposals[at]])
+        mirror = np.full(len(at), mirrored)
+        crops = Crops(pictures, views.focal_px, views.R_body_virtual, views.centres, mirror, evidence)
         log_range, sigma, centre, *rest = self._ranges(crops)
         estimates = Estimates(views.rays(centre), log_range, sigma, *rest)
         if self._known_size is not None:
@@ -204,10 +208,8 @@ class Cascade:
         log_range = np.where(near, np.log(range_m), estimates.log_range)
         return at, estimates._replace(bearing=places / range_m[:, None], log_range=log_range)
 
-    def _ranges(self, crops: Sequence[Crop]) -> RangeEstimates:
+    def _ranges(self, crops: Crops) -> RangeEstimates:
         """An estimate for each crop. If the network fails on several, each half is tried alone: one crop is lost."""
-        if not crops:
-            return RangeEstimates.unknown(0)
         try:
             return self._network.ranges(crops)
         except (FloatingPointError, ValueError) as error:
@@ -222,8 +224,6 @@ class Cascade:
         self, proposals: NDArray[Any], at: IntArray, aims: _Aims, shown: Estimates
     ) -> tuple[IntArray, Estimates]:
         """The mean of each estimate and that of its mirrored crop; estimates that it contradicts are dropped."""
-        if not len(at):
-            return at, shown.take(at)
         mirrored = aims._replace(half_angle=self._rules.mirror_scale * aims.half_angle)
         at, others = self._estimated(proposals, at, mirrored, mirrored=True)
         estimates = shown.take(at)
@@ -256,3 +256,12 @@ class Cascade:
 
     def _drop(self, why: str) -> None:
         self.reasons.append(Reason(ReasonKind.PROPOSAL, f"proposal: {why}"))
+
+
+def unseen(predicted: Sequence[Proposal], shown: Estimates) -> BoolArray:
+    """(k,) which predicted drones none of the estimates is of. One at another range, behind or in front, is not."""
+    direction = np.array([one.direction for one in predicted]).reshape(-1, 1, 3)
+    half_angle, range_m = np.array([(one.half_angle, one.range_m) for one in predicted]).reshape(-1, 2).T
+    same = angles_between(direction, shown.bearing) < half_angle[:, None]
+    same &= np.abs(np.log(range_m)[:, None] - shown.log_range) < _SAME_RANGE
+    return np.asarray(~same.any(axis=1))

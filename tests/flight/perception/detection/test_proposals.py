@@ -19,6 +19,7 @@ from flockd.flight.perception.detection.proposals import (
     propose_instances,
     propose_predictions,
 )
+from flockd.flight.perception.detection.refinement import Estimates, unseen
 from flockd.flight.tracking import Prediction
 from tests.flight.perception.cameras import SECOND_STAGE
 from tests.make import rig_camera, vehicle
@@ -71,9 +72,10 @@ def test_a_neighbour_is_searched_for_though_another_range_is_detected_there(rang
     front = Rig({"front": CAMERA})
     ahead = CAMERA.T_body_camera.rotation @ [0.0, 0.0, 1.0]
     beside = CAMERA.T_body_camera.rotation @ [math.sin(math.radians(2.0)), 0.0, math.cos(math.radians(2.0))]
-    near = Prediction(3.0 * ahead, 0.5)
-    found, _ = propose_predictions(front, vehicle(), [near], [(beside, math.log(range_m))], RULES)
-    assert len(found) == searched
+    near, _ = propose_predictions(front, vehicle(), [Prediction(3.0 * ahead, 0.5)], RULES)
+    assert near[0].range_m == pytest.approx(3.0)
+    shown = Estimates(beside[None], np.array([math.log(range_m)]), *np.ones((4, 1)))
+    assert unseen(near, shown).tolist() == [bool(searched)]
 
 
 # How many.

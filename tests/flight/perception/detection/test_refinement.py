@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from flockd.core.config.perception import DetectionParameters, PerceptionConfig
 from flockd.core.messages import FloatArray, LearnedSize
 from flockd.flight.geometry import log_polar
-from flockd.flight.perception import Crop, Perception, RangeEstimates
+from flockd.flight.perception import Crops, Perception, RangeEstimates
 from flockd.flight.perception.detection.instances import Instance
 from flockd.flight.perception.detection.nms import fuse, suppress
 from flockd.flight.perception.detection.proposals import Proposal
@@ -27,14 +27,13 @@ def flyer() -> Flyer:
     return Flyer(scenario_with((0.0, 0.0, -4.5), (3.0, 0.0, -4.5)))
 
 
-def answering(flyer: Flyer, change: Callable[[int, Crop, RangeEstimates], RangeEstimates]) -> list[Crop]:
+def answering(flyer: Flyer, change: Callable[[int, Crops, RangeEstimates], RangeEstimates]) -> list[Crops]:
     """Has the second stage's estimates, of one crop at a time, changed by how often it was asked before; its crops."""
-    estimates, crops = flyer.truth.sound("ranges"), list[Crop]()
+    estimates, crops = flyer.truth.sound("ranges"), list[Crops]()
 
-    def ranges(asked: Sequence[Crop]) -> RangeEstimates:
-        (crop,) = asked
-        given = change(len(crops), crop, estimates(asked))
-        crops.append(crop)
+    def ranges(asked: Crops) -> RangeEstimates:
+        given = change(len(crops), asked, estimates(asked))
+        crops.append(asked)
         return given
 
     flyer.truth.instead["ranges"] = ranges
@@ -68,8 +67,8 @@ def test_a_proposal_is_cropped_again_until_the_crop_suits_the_drone(
 def test_the_mirrored_crop_is_weighted_by_its_variance(flyer: Flyer) -> None:
     """A drone is 3 m away: the last crop says 3 m, its mirror image 6."""
 
-    def judged(asked: int, crop: Crop, one: RangeEstimates) -> RangeEstimates:
-        if crop.mirrored:
+    def judged(asked: int, crop: Crops, one: RangeEstimates) -> RangeEstimates:
+        if crop.mirrored.all():
             says = {"log_range": math.log(6.0), "log_range_sigma": 0.1, "drone_probability": 0.85}
         else:
             says = {"log_range_sigma": 0.05, "drone_probability": 0.9}
@@ -77,7 +76,7 @@ def test_the_mirrored_crop_is_weighted_by_its_variance(flyer: Flyer) -> None:
 
     crops = answering(flyer, judged)
     (detection,) = flyer.step().detections
-    assert [crop.mirrored for crop in crops] == [False, False, True]
+    assert [crop.mirrored.all() for crop in crops] == [False, False, True]
     assert detection.range_m == pytest.approx(3.0 * 2 ** (1 / 5), rel=0.005)  # 1 of 1 + 4
     assert detection.drone_probability == pytest.approx(0.85)
 
