@@ -42,7 +42,7 @@ NUMBERS_OF_FLIGHT = 199
 """In constants of the modules of `flockd/flight`."""
 SLACK = 0.02
 """A budget that is farther above what there is is to be lowered."""
-STEPS = {"crossing": (9_290, 16.4), "normal": (7_690, 13.8)}
+STEPS = {"crossing": (9_190, 16.4), "normal": (7_500, 13.8)}
 """Python calls and network runs of a step in a recorded flight of tests/review/replay."""
 
 

@@ -168,6 +168,8 @@ class Cascade:
             for column, values in zip(shown, estimates, strict=True):
                 column[at] = values
             at = at[~enough]
+            if not len(at):
+                break
         at, estimates = self._with_mirrored(of, settled.nonzero()[0], aims, shown)
         probability = np.minimum(least[at], estimates.drone_probability)
         rejected[at] = probability <= self._stage.another_crop_probability
